@@ -1,0 +1,234 @@
+"""A scenario: everything that a user chooses for a run, read from TOML and validated.
+
+Errors name the file, the key, the value and what was expected. The models are frozen; options of the command line are
+laid over the file with `Scenario.with_changes`.
+"""
+
+import json
+import tomllib
+import zlib
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from nav.errors import HilError
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Vector = tuple[Finite, Finite, Finite]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Sine(_Model):
+    """One sinusoid of a motion channel: amplitude * sin(2 pi tau / period + phase)."""
+
+    amplitude: Finite
+    period_s: Positive
+    phase_deg: Finite = 0.0
+
+
+class Channel(_Model):
+    """A motion channel over the motion's own time tau: offset + rate * tau + sum of sinusoids."""
+
+    offset: Finite = 0.0
+    rate: Finite = 0.0
+    sines: tuple[Sine, ...] = ()
+
+
+class Cone(_Model):
+    """Coning: the body's x axis is held, the rotation vector of fixed length turns in the body's y-z plane."""
+
+    half_angle_deg: Annotated[float, Field(ge=0, lt=90)]
+    frequency_hz: Finite
+
+
+class MotionConfig(_Model):
+    """Analytic motion of the vehicle.
+
+    The motion runs on its own time tau(t): tau = 0 while the vehicle stands for `rest_s`, then tau speeds up smoothly over
+    `ramp_s` until it runs with t. Path channels are metres north, east and up of the start; angle channels are degrees.
+    With ``attitude = "coordinated"`` heading and pitch follow the path and roll balances the turn; the angle channels are
+    added to that.
+    """
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] = 50.0
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] = 36.25
+    height_m: Finite = 150.0
+    rest_s: NotNegative = 0.0
+    ramp_s: NotNegative = 0.0
+    attitude: Literal["free", "coordinated"] = "free"
+    north: Channel = Channel()
+    east: Channel = Channel()
+    up: Channel = Channel()
+    heading: Channel = Channel()
+    pitch: Channel = Channel()
+    roll: Channel = Channel()
+    cone: Cone | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "MotionConfig":
+        if self.rest_s > 0 and self.ramp_s == 0:
+            raise ValueError("rest_s > 0 needs ramp_s > 0: the vehicle cannot jump from rest into motion")
+        if self.attitude == "coordinated" and self.north == Channel() == self.east:
+            raise ValueError('attitude = "coordinated" needs a path: give motion.north or motion.east')
+        return self
+
+
+class HeadConfig(_Model):
+    """The simulated sensor head."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=10000)] = 1000.0
+    layout: Literal["fd", "classic"] = "fd"
+    serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
+    mounting_deg: Vector = (0.0, 0.0, 0.0)
+    """Heading, pitch, roll of the head's axes relative to the body."""
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """Place of the head in the body, forward-right-down of the navigated point."""
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _whole_microseconds(cls, value: float) -> float:
+        if abs(1e6 / value - round(1e6 / value)) > 1e-9:
+            raise ValueError("the sample period must be a whole number of microseconds (the head's clock counts them)")
+        return value
+
+
+class StartConfig(_Model):
+    """A known start; what is left out comes from the alignment or from the motion's truth."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
+    height_m: Finite | None = None
+    heading_deg: Finite | None = None
+
+
+class NavigationConfig(_Model):
+    """The navigation core."""
+
+    alignment: Literal["gyrocompass", "level", "truth"] = "gyrocompass"
+    """``gyrocompass``: vertical and north from rest; ``level``: vertical from rest, heading given, gyro bias captured;
+    ``truth``: the simulated start, no alignment."""
+    align_s: Annotated[float, Field(ge=0.5, le=3600)] = 30.0
+    start: StartConfig = StartConfig()
+    attitude: str = "two-sample"
+    mechanization: str = "geographic"
+    gravity: Literal["normal"] = "normal"
+    gap_interpolate_s: NotNegative = 0.1
+    """Gaps up to this length are filled by interpolation; longer ones are bridged and the mode is degraded."""
+    gap_realign_s: Positive = 10.0
+    """After a gap longer than this nothing is bridged: the navigator aligns again."""
+    silence_s: Annotated[float, Field(gt=0, le=10)] = 0.1
+    """Without a sample for this long the mode is degraded."""
+    track_bias_at_rest: bool = False
+    """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
+
+
+class MavlinkConfig(_Model):
+    """Where and how often the solution goes out as MAVLink."""
+
+    links: tuple[str, ...] = ("udpout:127.0.0.1:14550",)
+    system_id: Annotated[int, Field(ge=1, le=255)] = 1
+    component_id: Annotated[int, Field(ge=1, le=255)] = 1
+    vehicle: Literal["fixed-wing", "quadrotor", "helicopter", "ground-rover", "surface-boat", "generic"] = "fixed-wing"
+    rates_hz: Mapping[str, NotNegative] = Field(default_factory=dict)
+    """Message name to rate, over the built-in rates; 0 switches a message off."""
+
+
+class Scenario(_Model):
+    """One run."""
+
+    name: str = "unnamed"
+    description: str = ""
+    duration_s: Positive | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
+    bus: str = "unix:dtg-hil"
+    driver: str = "dtg-head"
+    motion: MotionConfig = MotionConfig()
+    head: HeadConfig = HeadConfig()
+    navigation: NavigationConfig = NavigationConfig()
+    mavlink: MavlinkConfig = MavlinkConfig()
+
+    def with_changes(self, **changes: Any) -> "Scenario":
+        """A copy with `changes` laid over it (nested dictionaries reach nested keys), validated anew."""
+        return _validated(_merged(self.model_dump(mode="json"), changes), "command line")
+
+    def world_id(self) -> int:
+        """A 32-bit fingerprint of what the simulated head does: motion, head and seed; never 0.
+
+        The simulated head announces it, so that a bridge elsewhere knows whether its own truth applies.
+        """
+        world = self.model_dump(mode="json", include={"motion", "head", "seed"})
+        return zlib.crc32(json.dumps(world, sort_keys=True).encode()) or 1
+
+
+def load(path_or_name: str | Path | None) -> Scenario:
+    """The scenario in a TOML file, or a built-in one by name; None is the embedded default.
+
+    Raises
+    ------
+    HilError
+        The file is missing or cannot be read, is not TOML, or a key is unknown or has a wrong value.
+    """
+    source = "default" if path_or_name is None else str(path_or_name)
+    built_in = files("fixtures") / "scenarios" / f"{source}.toml"
+    path = Path(source)
+    if path.suffix != ".toml" and built_in.is_file():
+        text, source = built_in.read_text(), f"built-in scenario {source}"
+    else:
+        try:
+            text = path.read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "not a text file"
+            raise HilError(
+                f"scenario {source}: {reason}; give a TOML file or one of: {', '.join(built_in_names())}"
+            ) from error
+    return parse(text, source)
+
+
+def parse(text: str, source: str) -> Scenario:
+    """The scenario in a TOML text; `source` names it in errors.
+
+    Raises
+    ------
+    HilError
+        As for `load`.
+    """
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise HilError(f"scenario {source}: not TOML: {error}") from error
+    return _validated(table, source)
+
+
+def built_in_names() -> list[str]:
+    """Names of the built-in scenarios."""
+    folder = files("fixtures") / "scenarios"
+    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+
+
+def _validated(table: Mapping[str, Any], source: str) -> Scenario:
+    try:
+        return Scenario.model_validate(table)
+    except ValidationError as error:
+        lines = []
+        for problem in error.errors():
+            key = ".".join(str(part) for part in problem["loc"]) or "scenario"
+            what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
+            value = "" if isinstance(problem["input"], Mapping) else f" = {problem['input']!r}"
+            lines.append(f"scenario {source}: {key}{value}: {what}")
+        raise HilError("\n".join(lines)) from error
+
+
+def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        inner = merged.get(key)
+        merged[key] = _merged(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
+    return merged

@@ -1,0 +1,130 @@
+"""The samples that flow down the spine: what a head or a board delivers, as batches of increments.
+
+A batch is a set of equally long arrays, one row a sample. `ImuIncrements` is what the navigator takes from any board;
+`HeadIncrements` is what a dual-DTG head delivers before :mod:`nav.instruments.head` turns it into `ImuIncrements`.
+"""
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+class Validity(IntFlag):
+    """What is wrong with a sample; 0 is a good one."""
+
+    GOOD = 0
+    INTERPOLATED = 1
+    """Made up by the gap policy between two received samples."""
+    BRIDGED = 2
+    """Made up over a gap longer than the policy interpolates: attitude and velocity are no longer trusted."""
+    SENSOR = 4
+    """The sensor itself flags the sample (built-in test, saturation)."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuIncrements:
+    """Increments of one IMU in body axes (Forward-Right-Down).
+
+    Attributes
+    ----------
+    time : (n,) float
+        Device time at the end of each step, s.
+    step : (n,) float
+        Length of each step, s.
+    dtheta : (n, 3) float
+        Angle increments: integral of ``w_ib_b`` over the step, rad.
+    dvel : (n, 3) float
+        Velocity increments: integral of ``f_b`` over the step, m/s.
+    validity : (n,) int
+        `Validity` of each sample.
+    sequence : (n,) int
+        Sample counter of the device, unwrapped.
+    """
+
+    time: FloatArray
+    step: FloatArray
+    dtheta: FloatArray
+    dvel: FloatArray
+    validity: IntArray
+    sequence: IntArray
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def rows(self, start: int, stop: int) -> "ImuIncrements":
+        """The samples `start` to `stop` as views."""
+        return ImuIncrements(
+            self.time[start:stop],
+            self.step[start:stop],
+            self.dtheta[start:stop],
+            self.dvel[start:stop],
+            self.validity[start:stop],
+            self.sequence[start:stop],
+        )
+
+    @staticmethod
+    def empty(n: int) -> "ImuIncrements":
+        """Room for `n` samples."""
+        return ImuIncrements(
+            np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n, np.int64)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class HeadIncrements:
+    """Raw increments of a head with two DTGs and three pendulum accelerometers, in head axes.
+
+    Gyro 1 spins along z and senses x and y; gyro 2 spins along x and senses y and z.
+
+    Attributes
+    ----------
+    time, step, validity, sequence
+        As in `ImuIncrements`.
+    dtheta : (n, 4) float
+        Angle increments of the axes g1x, g1y, g2y, g2z, rad.
+    rotor : (n, 4) float
+        Rotor tilt angles of the same axes at the end of the step, rad; NaN where the wire does not carry them.
+    dvel : (n, 3) float
+        Velocity increments along x, y, z, m/s.
+    """
+
+    time: FloatArray
+    step: FloatArray
+    dtheta: FloatArray
+    rotor: FloatArray
+    dvel: FloatArray
+    validity: IntArray
+    sequence: IntArray
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def rows(self, start: int, stop: int) -> "HeadIncrements":
+        """The samples `start` to `stop` as views."""
+        return HeadIncrements(
+            self.time[start:stop],
+            self.step[start:stop],
+            self.dtheta[start:stop],
+            self.rotor[start:stop],
+            self.dvel[start:stop],
+            self.validity[start:stop],
+            self.sequence[start:stop],
+        )
+
+    @staticmethod
+    def empty(n: int) -> "HeadIncrements":
+        """Room for `n` samples."""
+        return HeadIncrements(
+            np.zeros(n),
+            np.zeros(n),
+            np.zeros((n, 4)),
+            np.zeros((n, 4)),
+            np.zeros((n, 3)),
+            np.zeros(n, np.int64),
+            np.zeros(n, np.int64),
+        )
