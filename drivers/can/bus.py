@@ -1,0 +1,178 @@
+"""Opening a bus by URL: the bulk interface that the bridge, the head and the tools use on every CAN back end.
+
+``unix:NAME`` is our own (:mod:`drivers.can.unix_bus`); anything else is python-can: ``socketcan:vcan0``, ``virtual:NAME``,
+``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
+"""
+
+import contextlib
+import errno
+import socket
+import time
+from typing import Any, Protocol
+from urllib.parse import parse_qsl
+
+import can
+
+from drivers.can.convert import from_message, to_message
+from drivers.can.frames import FrameArray
+from drivers.can.unix_bus import UnixPort
+from nav.errors import HilError
+
+RECEIVE_BUFFER = 8 << 20
+REOPEN_S = 0.5
+"""Time between tries to reopen a bus that failed."""
+
+
+class Port(Protocol):
+    """A bus, opened."""
+
+    dropped: int
+    """Frames that this end could not hand on."""
+
+    def receive(self, batch: FrameArray, timeout: float) -> int:
+        """Fill `batch` (at least 64 long) with what is there, waiting up to `timeout` s for the first; the number."""
+
+    def send(self, batch: FrameArray) -> None:
+        """Send all of `batch`."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
+    """Open the bus at `url`.
+
+    Parameters
+    ----------
+    url : str
+        See the module.
+    listen : bool
+        False for a pure sender.
+    lossless : bool
+        `send` waits for slow listeners where the back end can (``unix:``).
+
+    Raises
+    ------
+    HilError
+        The URL is malformed or the bus cannot be opened; the message says how to make it.
+    """
+    interface, separator, rest = url.partition(":")
+    channel, _, query = rest.partition("?")
+    if not separator or not channel:
+        raise HilError(f"bus {url!r}: expected INTERFACE:CHANNEL, as unix:dtg-hil or socketcan:vcan0")
+    if interface == "unix":
+        if query:
+            raise HilError(f"bus {url!r}: unix: takes no options")
+        return UnixPort(channel, listen=listen, lossless=lossless)
+    options = {key: _typed(value) for key, value in parse_qsl(query, keep_blank_values=True)}
+    return PythonCanPort(url, interface, channel, options)
+
+
+class PythonCanPort:
+    """A bus of python-can as a `Port`; reopened when the interface fails (`failures` counts)."""
+
+    def __init__(self, url: str, interface: str, channel: str, options: dict[str, Any]) -> None:
+        self.url = url
+        self.dropped = 0
+        self.failures = 0
+        self._arguments = {"interface": interface, "channel": channel, **options}
+        if interface in {"socketcan", "virtual"}:
+            self._arguments.setdefault("fd", True)
+        self._bus: can.BusABC | None = self._open()
+        self._retry = 0.0
+
+    def _open(self) -> can.BusABC:
+        try:
+            bus = can.Bus(**self._arguments)
+        except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
+            raise HilError(f"bus {self.url}: {_reason(self._arguments, error)}") from error
+        sock = getattr(bus, "socket", None) or getattr(getattr(bus, "_multicast", None), "_socket", None)
+        if sock is not None:
+            for option in (getattr(socket, "SO_RCVBUFFORCE", 33), socket.SO_RCVBUF):
+                with contextlib.suppress(OSError):
+                    sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
+        return bus
+
+    def _failed(self) -> None:
+        self.failures += 1
+        if self._bus is not None:
+            with contextlib.suppress(Exception):
+                self._bus.shutdown()
+        self._bus = None
+        self._retry = time.monotonic() + REOPEN_S
+
+    def _alive(self) -> can.BusABC | None:
+        if self._bus is None and time.monotonic() >= self._retry:
+            try:
+                self._bus = self._open()
+            except HilError:
+                self._retry = time.monotonic() + REOPEN_S
+        return self._bus
+
+    def receive(self, batch: FrameArray, timeout: float) -> int:
+        """See `Port.receive`."""
+        bus = self._alive()
+        if bus is None:
+            time.sleep(min(timeout, REOPEN_S))
+            return 0
+        n = 0
+        try:
+            message = bus.recv(timeout)
+            while message is not None:
+                from_message(message, batch[n])
+                n += 1
+                message = bus.recv(0) if n < len(batch) else None
+        except (can.CanError, OSError):
+            self._failed()
+        return n
+
+    def send(self, batch: FrameArray) -> None:
+        """See `Port.send`; a frame that the interface refuses is dropped and counted."""
+        for row in batch:
+            bus = self._alive()
+            if bus is None:
+                self.dropped += 1
+                continue
+            try:
+                bus.send(to_message(row), timeout=0.1)
+            except can.CanError as error:
+                self.dropped += 1
+                code = getattr(error, "error_code", None)
+                if code in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO}:
+                    self._failed()
+            except OSError:
+                self.dropped += 1
+                self._failed()
+
+    def close(self) -> None:
+        """See `Port.close`."""
+        if self._bus is not None:
+            self._bus.shutdown()
+            self._bus = None
+
+
+def _typed(text: str) -> Any:
+    if text.lower() in {"true", "false"}:
+        return text.lower() == "true"
+    for convert in (int, float):
+        with contextlib.suppress(ValueError):
+            return convert(text)
+    return text
+
+
+def _reason(arguments: dict[str, Any], error: Exception) -> str:
+    interface, channel = arguments["interface"], arguments["channel"]
+    code = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if interface == "socketcan":
+        if not hasattr(socket, "AF_CAN") or code == errno.EAFNOSUPPORT:
+            return "this kernel has no SocketCAN; use unix:NAME or udp_multicast:239.74.163.2 (see: hil doctor)"
+        if code in {errno.ENODEV, errno.ENXIO}:
+            make = f"ip link add {channel} type vcan && ip link set {channel} mtu 72 up"
+            if not channel.startswith("vcan"):
+                make = f"ip link set {channel} up type can bitrate 500000 dbitrate 2000000 fd on"
+            return f"no interface {channel}; make it with: sudo sh -c '{make}' (see: hil doctor)"
+        if code == errno.ENETDOWN:
+            return f"interface {channel} is down; raise it with: sudo ip link set {channel} up"
+    if isinstance(error, can.CanInterfaceNotImplementedError):
+        return f"python-can knows no interface {interface!r} (or its library is missing): {error}"
+    return f"{error}"

@@ -1,0 +1,240 @@
+"""The `unix:` bus: CAN frames between processes of one machine over AF_UNIX SEQPACKET, without loss and without a kernel CAN.
+
+Every participant listens on a socket of its own in the bus's folder and, on joining, connects to all that are there; so
+the bus is a full mesh with no hub, and participants may start, stop and die in any order. A packet holds one or more
+whole frames (80 bytes each, see :mod:`drivers.can.frames`); a sender may put many into one packet, which is what makes
+`--speed max` fast. `UnixPort` is the bulk interface of the bridge, `UnixBus` the python-can interface ``unix``.
+"""
+
+import contextlib
+import errno
+import fcntl
+import os
+import re
+import select
+import socket
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+
+from drivers.can.convert import from_message, to_message
+from drivers.can.frames import FRAME, FrameArray, frames
+from nav.errors import HilError
+
+PACKET = 64
+"""Most frames in one packet."""
+_BUFFER = 4 << 20
+
+
+class UnixPort:
+    """One participant of the bus `name`.
+
+    Parameters
+    ----------
+    name : str
+        Letters, digits, dot, dash, underscore.
+    listen : bool
+        False for a pure sender: others do not queue frames for it.
+    lossless : bool
+        True: `send` waits for a slow listener; False: it drops the packet for that listener and counts it.
+
+    Raises
+    ------
+    HilError
+        Bad name, or the folder of the bus belongs to another user.
+    """
+
+    def __init__(self, name: str, *, listen: bool = True, lossless: bool = False) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9._-]{1,40}", name) or name.startswith("."):
+            raise HilError(f"unix:{name}: a bus name has 1 to 40 letters, digits, dots, dashes or underscores")
+        self.name = name
+        self.dropped = 0
+        """Frames that did not fit into a listener's queue."""
+        self._listen = listen
+        self._lossless = lossless
+        self._peers: dict[int, socket.socket] = {}
+        self._deaf: set[int] = set()
+        self._epoll = select.epoll()
+        folder = _folder(name)
+        self._path = folder / f"{os.getpid()}-{time.monotonic_ns():x}.sock"
+        with _locked(folder):
+            others = [entry for entry in folder.glob("*.sock") if entry != self._path]
+            self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+            self._listener.bind(str(self._path))
+            self._listener.listen(64)
+            self._epoll.register(self._listener, select.EPOLLIN)
+            for other in others:
+                self._connect(other)
+
+    def _connect(self, path: Path) -> None:
+        peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            peer.connect(str(path))
+        except OSError:  # its owner died without cleaning up
+            peer.close()
+            path.unlink(missing_ok=True)
+            return
+        self._add(peer)
+
+    def _add(self, peer: socket.socket) -> None:
+        for option in (getattr(socket, "SO_SNDBUFFORCE", 32), socket.SO_SNDBUF):
+            with contextlib.suppress(OSError):
+                peer.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
+        if not self._listen:
+            peer.shutdown(socket.SHUT_RD)
+        else:
+            self._epoll.register(peer, select.EPOLLIN)
+        self._peers[peer.fileno()] = peer
+
+    def _remove(self, fd: int) -> None:
+        peer = self._peers.pop(fd)
+        self._deaf.discard(fd)
+        if self._listen:
+            self._epoll.unregister(fd)
+        peer.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                peer, _ = self._listener.accept()
+            except OSError:
+                return
+            peer.setblocking(False)
+            self._add(peer)
+
+    @property
+    def listeners(self) -> int:
+        """Participants that take frames from us."""
+        self._accept()
+        return len(self._peers) - len(self._deaf)
+
+    def fileno(self) -> int:
+        """Readable when `receive` would find something."""
+        return self._epoll.fileno()
+
+    def receive(self, batch: FrameArray, timeout: float) -> int:
+        """Fill `batch` (at least `PACKET` long) with what is there; waits up to `timeout` s for the first frame."""
+        filled = 0
+        deadline = time.monotonic() + timeout
+        view = memoryview(batch.view(np.uint8))
+        while filled == 0:
+            ready = self._epoll.poll(max(0.0, deadline - time.monotonic()))
+            if not ready:
+                return 0
+            for fd, _ in ready:
+                if fd == self._listener.fileno():
+                    self._accept()
+                    continue
+                while filled + PACKET <= len(batch):
+                    try:
+                        size = self._peers[fd].recv_into(view[filled * FRAME.itemsize :])
+                    except BlockingIOError:
+                        break
+                    except OSError:
+                        size = 0
+                    if size == 0:
+                        self._remove(fd)
+                        break
+                    filled += size // FRAME.itemsize
+        return filled
+
+    def send(self, batch: FrameArray) -> None:
+        """Send `batch` to every listener, stamped with the host's clock."""
+        self._accept()
+        for start in range(0, len(batch), PACKET):
+            packet = batch[start : start + PACKET]
+            packet["time_ns"] = time.time_ns()
+            data = packet.tobytes()
+            for fd, peer in list(self._peers.items()):
+                if fd not in self._deaf:
+                    self._send_one(fd, peer, data)
+
+    def _send_one(self, fd: int, peer: socket.socket, data: bytes) -> None:
+        while True:
+            try:
+                peer.send(data)
+                return
+            except BlockingIOError:
+                if not self._lossless:
+                    self.dropped += len(data) // FRAME.itemsize
+                    return
+                select.select([], [fd], [], 1.0)
+            except OSError as error:
+                if error.errno == errno.EPIPE and _alive(peer):
+                    self._deaf.add(fd)
+                else:
+                    self._remove(fd)
+                return
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._path.unlink(missing_ok=True)
+        for fd in list(self._peers):
+            self._remove(fd)
+        self._listener.close()
+        self._epoll.close()
+
+
+class UnixBus(can.BusABC):
+    """python-can interface ``unix``: ``can.Bus(interface="unix", channel="dtg-hil")``; classic and FD frames."""
+
+    def __init__(self, channel: str, can_filters: Any = None, **kwargs: Any) -> None:
+        self._port = UnixPort(channel)
+        self._batch = frames(2 * PACKET)
+        self._one = frames(1)
+        self._queue: list[can.Message] = []
+        self.channel_info = f"unix:{channel}"
+        self._can_protocol = can.CanProtocol.CAN_FD
+        super().__init__(channel=channel, can_filters=can_filters, **kwargs)
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self._queue:
+            n = self._port.receive(self._batch, 3600.0 if timeout is None else timeout)
+            self._queue = [to_message(row, self.channel_info) for row in self._batch[:n]][::-1]
+        return (self._queue.pop() if self._queue else None), False
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send one message to every listener."""
+        from_message(msg, self._one[0])
+        self._port.send(self._one)
+
+    def fileno(self) -> int:
+        """Readable when a message can be received."""
+        return self._port.fileno()
+
+    def shutdown(self) -> None:
+        """Leave the bus."""
+        if not self._is_shutdown:
+            self._port.close()
+        super().shutdown()
+
+
+def _alive(peer: socket.socket) -> bool:
+    """Whether the other end still exists (it may have shut its receiving side only)."""
+    poll = select.poll()
+    poll.register(peer, 0)
+    return not poll.poll(0)
+
+
+def _folder(name: str) -> Path:
+    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
+    root = Path(base) / f"dtg-hil-{os.getuid()}"
+    folder = root / name
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if root.stat().st_uid != os.getuid():
+        raise HilError(f"unix:{name}: {root} belongs to another user; set XDG_RUNTIME_DIR to a folder of yours")
+    root.chmod(0o700)
+    return folder
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Joining is serialised, so that two participants never connect to each other twice."""
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

@@ -1,0 +1,122 @@
+"""Averages at rest, in blocks, with the tests that say "this is not rest" or "these are not metres per second".
+
+The sums run sample by sample, so that the result does not depend on how samples were batched.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from nav.increments import FloatArray
+from nav.kernel import kernel
+
+BLOCK_S = 0.5
+"""Length of a block, s."""
+RATE_LIMIT = 0.01
+"""A block whose mean rate differs by more than this from the mean so far is motion, rad/s."""
+FORCE_LIMIT = 0.05
+"""A block whose mean specific force differs by more than this is motion, m/s^2."""
+TURN_LIMIT = 0.1
+"""A mean rate above this is motion and not bias, rad/s."""
+
+# Layout of the sums: block time, dtheta, dvel | total time, dtheta, dvel | blocks, sum of squares of block rate, force
+_BLOCK, _TOTAL, _COUNT, _SQUARES = 0, 7, 14, 15
+SUMS = 21
+
+
+@kernel
+def accumulate(
+    sums: FloatArray, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, goal_s: float
+) -> tuple[int, int]:
+    """Add samples until a block of `BLOCK_S` is complete or the batch ends.
+
+    Parameters
+    ----------
+    sums : (SUMS,) float
+        Updated in place.
+    step, dtheta, dvel
+        As in `ImuIncrements`.
+    goal_s : float
+        Time to average in all.
+
+    Returns
+    -------
+    used : int
+        Samples consumed.
+    event : int
+        0 the batch is used up; 1 a block was completed; 2 the goal is reached; 3 motion: the sums start again.
+    """
+    for k in range(step.shape[0]):
+        sums[_BLOCK] += step[k]
+        for i in range(3):
+            sums[_BLOCK + 1 + i] += dtheta[k, i]
+            sums[_BLOCK + 4 + i] += dvel[k, i]
+        if sums[_BLOCK] < BLOCK_S - 1e-9:
+            continue
+        time = sums[_BLOCK]
+        moved = False
+        rate2 = 0.0
+        for i in range(6):
+            mean = sums[_BLOCK + 1 + i] / time
+            if i < 3:
+                rate2 += mean * mean
+            if sums[_COUNT] > 0.0:
+                so_far = sums[_TOTAL + 1 + i] / sums[_TOTAL]
+                moved = moved or abs(mean - so_far) > (RATE_LIMIT if i < 3 else FORCE_LIMIT)
+        if moved or rate2 > TURN_LIMIT * TURN_LIMIT:
+            for i in range(sums.shape[0]):
+                sums[i] = 0.0
+            return k + 1, 3
+        for i in range(6):
+            mean = sums[_BLOCK + 1 + i] / time
+            sums[_SQUARES + i] += mean * mean
+        for i in range(7):
+            sums[_TOTAL + i] += sums[_BLOCK + i]
+            sums[_BLOCK + i] = 0.0
+        sums[_COUNT] += 1.0
+        return k + 1, 2 if sums[_TOTAL] >= goal_s - 1e-9 else 1
+    return step.shape[0], 0
+
+
+@dataclass(frozen=True, slots=True)
+class Means:
+    """Averages over all complete blocks.
+
+    Attributes
+    ----------
+    time_s : float
+        Averaged time, s.
+    w, f : (3,) float
+        Mean rate, rad/s, and specific force, m/s^2.
+    sigma_w, sigma_f : float
+        Standard deviation of the means (worst axis) from the scatter of the blocks.
+    """
+
+    time_s: float
+    w: FloatArray
+    f: FloatArray
+    sigma_w: float
+    sigma_f: float
+
+
+def means(sums: FloatArray) -> Means:
+    """The averages in `sums` (at least one complete block)."""
+    time, count = sums[_TOTAL], sums[_COUNT]
+    mean = sums[_TOTAL + 1 : _TOTAL + 7] / time
+    variance = np.maximum(sums[_SQUARES : _SQUARES + 6] / count - mean**2, 0.0) / max(count - 1.0, 1.0)
+    sigma = np.sqrt(variance)
+    return Means(float(time), mean[:3], mean[3:], float(sigma[:3].max()), float(sigma[3:].max()))
+
+
+def progress(sums: FloatArray, goal_s: float) -> float:
+    """How much of `goal_s` is averaged, 0..1."""
+    return min(1.0, float(sums[_TOTAL] / goal_s))
+
+
+def gravity_verdict(f_b: FloatArray) -> str | None:
+    """What is wrong with the specific force at rest (3,), m/s^2; None when it is 1 g to five per cent."""
+    g = float(np.linalg.norm(f_b)) / 9.80665
+    if math.isfinite(g) and abs(g - 1.0) <= 0.05:
+        return None
+    return f"specific force at rest is {g:.2f} g: units or signs?"

@@ -1,0 +1,133 @@
+"""The gap policy: what the navigator gets where samples are missing.
+
+A gap is seen in the sample counter and sized by it and by device time. Up to `interpolate_s` the missing steps are
+interpolated between the rate and force before and after; up to `realign_s` they are interpolated too but marked
+`BRIDGED`, because nobody knows what happened in between; beyond that nothing is filled and the caller aligns again.
+The result depends on the samples alone, never on how they were batched.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from nav.increments import FloatArray, ImuIncrements, Validity
+
+MAX_FILL = 4096
+"""Most steps put into one gap; a longer one gets longer steps."""
+
+
+@dataclass(frozen=True, slots=True)
+class GapPolicy:
+    """Limits of the policy, s; a gap is the time that no sample covers."""
+
+    interpolate_s: float = 0.1
+    realign_s: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A gap that was met.
+
+    Attributes
+    ----------
+    row : int
+        Row of the result where the filled steps begin (or where the sample after the gap stands).
+    time, length_s : float
+        Device time of the last sample before, s, and length of the gap, s.
+    missing : int
+        Samples missing by the counter.
+    realign : bool
+        Longer than the policy bridges.
+    """
+
+    row: int
+    time: float
+    length_s: float
+    missing: int
+    realign: bool
+
+
+class GapFiller:
+    """Fills gaps in a stream of batches."""
+
+    def __init__(self, policy: GapPolicy) -> None:
+        self.policy = policy
+        self._sequence: int | None = None
+        self._time = 0.0
+        self._rate = np.zeros(3)
+        self._force = np.zeros(3)
+
+    def fill(self, imu: ImuIncrements) -> tuple[ImuIncrements, list[Gap]]:
+        """The batch with its gaps filled; the batch itself where there is none."""
+        if len(imu) == 0:
+            return imu, []
+        before = self._sequence
+        last = len(imu) - 1
+        jumps = np.flatnonzero(np.diff(imu.sequence) != 1) + 1
+        if before is not None and imu.sequence[0] != before + 1:
+            jumps = np.concatenate(([0], jumps))
+        result, gaps = (imu, []) if len(jumps) == 0 else self._filled(imu, jumps)
+        self._sequence = int(imu.sequence[last])
+        self._time = float(imu.time[last])
+        self._keep(imu, last)
+        return result, gaps
+
+    def _keep(self, imu: ImuIncrements, row: int) -> None:
+        step = imu.step[row]
+        if step > 0.0:
+            self._rate[:] = imu.dtheta[row] / step
+            self._force[:] = imu.dvel[row] / step
+
+    def _filled(self, imu: ImuIncrements, jumps: np.ndarray) -> tuple[ImuIncrements, list[Gap]]:
+        parts: list[ImuIncrements] = []
+        gaps: list[Gap] = []
+        rows = start = 0
+        for jump in jumps:
+            stop = int(jump)
+            if stop > start:
+                parts.append(imu.rows(start, stop))
+                rows += stop - start
+            if stop > 0:
+                time, sequence = float(imu.time[stop - 1]), int(imu.sequence[stop - 1])
+                self._keep(imu, stop - 1)
+            else:
+                time, sequence = self._time, self._sequence or 0
+            step = float(imu.step[stop])
+            length = float(imu.time[stop]) - step - time
+            missing = int(imu.sequence[stop]) - sequence - 1
+            realign = length > self.policy.realign_s or length < 0.0 or step <= 0.0
+            gaps.append(Gap(rows, time, length, missing, realign))
+            if not realign and length > 1e-9:
+                bridged = length > self.policy.interpolate_s
+                fill = self._interpolated(imu, stop, time, length, sequence, missing, bridged)
+                parts.append(fill)
+                rows += len(fill)
+            start = stop
+        parts.append(imu.rows(start, len(imu)))
+        return _joined(parts), gaps
+
+    def _interpolated(
+        self, imu: ImuIncrements, row: int, time: float, length: float, sequence: int, missing: int, bridged: bool
+    ) -> ImuIncrements:
+        count = min(max(missing, 1), MAX_FILL)
+        step = length / count
+        after_rate, after_force = imu.dtheta[row] / imu.step[row], imu.dvel[row] / imu.step[row]
+        weight = ((np.arange(count) + 0.5) / count)[:, None]
+        rate: FloatArray = self._rate * (1.0 - weight) + after_rate * weight
+        force: FloatArray = self._force * (1.0 - weight) + after_force * weight
+        mark = int(Validity.INTERPOLATED | (Validity.BRIDGED if bridged else Validity.GOOD))
+        numbers = sequence + 1 + (np.arange(count) * max(missing, 1)) // count
+        return ImuIncrements(
+            time + step * np.arange(1, count + 1),
+            np.full(count, step),
+            rate * step,
+            force * step,
+            np.full(count, mark, np.int64),
+            numbers,
+        )
+
+
+def _joined(parts: list[ImuIncrements]) -> ImuIncrements:
+    return ImuIncrements(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ImuIncrements.__dataclass_fields__)
+    )

@@ -1,0 +1,316 @@
+"""The navigator: gap policy, alignment and mechanization joined by a mode machine.
+
+It takes batches of `ImuIncrements` and answers one `NAV_STATE` row for each sample, received or filled. Everything it
+decides depends on the samples and on the explicit calls (`begin`, `realign`, `silent`) alone, in their order, never on
+how samples were batched and never on a clock: a recording replays bit for bit.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nav.alignment import rest
+from nav.alignment.analytic import AlignmentRefused, earth_rate_in_body, gyrocompass, level
+from nav.errors import HilError
+from nav.gaps import Gap, GapFiller, GapPolicy
+from nav.increments import FloatArray, ImuIncrements, Validity
+from nav.mechanization import check_choice, geographic
+from nav.rotation import euler_from_quaternion
+from nav.state import NAV_STATE, Health, Mode
+
+StateArray = NDArray[Any]
+Severity = Literal["info", "notice", "warning", "error"]
+
+DISTRUST = Health.SILENT | Health.BRIDGED | Health.SENSOR
+"""Health that makes the mode DEGRADED."""
+REST_WINDOW_S = 2.0
+"""Length of the windows in which the bias is tracked at rest, s."""
+REST_GAIN = 0.2
+"""Weight of one window in the tracked bias (time constant about 10 s)."""
+REST_BIAS_STEP = 0.003
+"""A window that would change the bias by more than this is a slow turn, not rest, rad/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What the navigator has to know.
+
+    Attributes
+    ----------
+    lat, lon, height : float
+        Position where alignment takes place, rad and m above the ellipsoid.
+    alignment : {"gyrocompass", "level"}
+        See :mod:`nav.alignment.analytic`; ``level`` needs `heading`.
+    align_s : float
+        Averaging time, s.
+    heading : float, optional
+        Given heading, rad.
+    track_bias_at_rest : bool
+        Keep averaging the gyro bias at rest.
+    position_trusted : bool
+        False marks the solution `Health.UNAIDED`.
+    """
+
+    lat: float = 0.0
+    lon: float = 0.0
+    height: float = 0.0
+    alignment: Literal["gyrocompass", "level"] = "gyrocompass"
+    align_s: float = 30.0
+    heading: float | None = None
+    track_bias_at_rest: bool = False
+    position_trusted: bool = True
+    attitude: str = "two-sample"
+    mechanization: str = "geographic"
+    gaps: GapPolicy = field(default_factory=GapPolicy)
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that the user is told: a change of mode, a gap, a refusal."""
+
+    time: float
+    severity: Severity
+    text: str
+
+
+class Navigator:
+    """See the module.
+
+    Raises
+    ------
+    HilError
+        Unknown method or mechanization, ``level`` without a heading.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        check_choice(settings.attitude, settings.mechanization)
+        if settings.alignment == "level" and settings.heading is None:
+            raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
+        self.settings = settings
+        self.mode = Mode.INIT
+        self.health = Health.GOOD if settings.position_trusted else Health.UNAIDED
+        self.gyro_bias = np.zeros(3)
+        self.heading = settings.heading
+        self._filler = GapFiller(settings.gaps)
+        self._sums = np.zeros(rest.SUMS)
+        self._state = geographic.initial_state(
+            settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4)
+        )
+        self._progress = 0.0
+        self._events: list[Event] = []
+        self._rows = np.zeros(256, NAV_STATE)
+        self._scratch = (np.empty((256, 3)), np.empty((256, 3)), np.empty((256, 4)))
+
+    def events(self) -> list[Event]:
+        """What happened since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def begin(self, lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, time: float) -> None:
+        """Navigate from a known state (position rad and m, velocity m/s, attitude) instead of aligning."""
+        self._state = geographic.initial_state(lat, lon, height, vel_n, q_nb)
+        self._progress = 1.0
+        self._say(time, "info", "navigating from a given start")
+        self.mode = Mode.NAVIGATE
+
+    def realign(self, time: float, reason: str) -> None:
+        """Give the attitude up and align again at the present position."""
+        self.mode = Mode.ALIGN
+        self.health &= ~(Health.BRIDGED | Health.MOVING | Health.UNITS | Health.RATE_TOO_SMALL)
+        self._sums[:] = 0.0
+        self._progress = 0.0
+        self._state = geographic.initial_state(*self._state[:3], np.zeros(3), np.zeros(4))
+        self._say(time, "notice", f"aligning: {reason}")
+
+    def silent(self) -> StateArray:
+        """The sensor has fallen silent: one row that repeats the last state and says so."""
+        self.health |= Health.SILENT
+        if self.mode == Mode.NAVIGATE:
+            self.mode = Mode.DEGRADED
+        row = self._rows[:1]
+        row["mode"], row["health"] = self.mode, self.health
+        self._say(float(row["time"][0]), "error", "no samples: the sensor is silent")
+        return row
+
+    def process(self, imu: ImuIncrements) -> StateArray:
+        """One row of `NAV_STATE` for each sample and each filled step; valid until the next call.
+
+        Raises
+        ------
+        HilError
+            An increment is not finite.
+        """
+        if not math.isfinite(float(imu.dtheta.sum()) + float(imu.dvel.sum()) + float(imu.time.sum())):
+            bad = ~(np.isfinite(imu.dtheta).all(1) & np.isfinite(imu.dvel).all(1) & np.isfinite(imu.time))
+            raise HilError(f"increment {int(imu.sequence[bad][0])} is not a number: mend the driver or the file")
+        imu, gaps = self._filler.fill(imu)
+        n = len(imu)
+        if n == 0:
+            return self._rows[:0]
+        rows = self._room(n)
+        rows["time"], rows["sequence"] = imu.time, imu.sequence
+        if self.mode == Mode.INIT:
+            self.realign(float(imu.time[0]), f"stand still for {self.settings.align_s:g} s")
+        if self.health & Health.SILENT:
+            self.health &= ~Health.SILENT
+            self._say(float(imu.time[0]), "notice", "samples arrive again")
+            self._trust(float(imu.time[0]))
+        start = 0
+        for gap in gaps:
+            self._run(imu, rows, start, gap.row)
+            self._meet(gap)
+            start = gap.row
+        self._run(imu, rows, start, n)
+        step = np.where(imu.step > 0.0, imu.step, 1.0)[:, None]
+        rows["w_ib_b"] = imu.dtheta / step - rows["gyro_bias"]
+        rows["f_b"] = imu.dvel / step
+        self._rows[0] = rows[-1]  # what `silent` repeats
+        return rows
+
+    def _room(self, n: int) -> StateArray:
+        if n + 1 > len(self._rows):
+            size = 2 * n + 1
+            self._rows = np.zeros(size, NAV_STATE)
+            self._scratch = (np.empty((size, 3)), np.empty((size, 3)), np.empty((size, 4)))
+        return self._rows[1 : n + 1]
+
+    def _run(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> None:
+        flags = imu.validity & Validity.SENSOR if imu.validity[start:stop].any() else None
+        while start < stop:
+            end = stop
+            flagged = flags is not None and bool(flags[start])
+            if flags is not None:  # up to the next change of the sensor's own flag
+                changes = np.flatnonzero(flags[start:stop] != flags[start])
+                end = start + int(changes[0]) if len(changes) else stop
+            if flagged != bool(self.health & Health.SENSOR):
+                self._flag(float(imu.time[start]), flagged)
+            start += (self._align if self.mode == Mode.ALIGN else self._navigate)(imu, rows, start, end)
+
+    def _align(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
+        goal = self.settings.align_s
+        used, event = rest.accumulate(
+            self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], goal
+        )
+        part = rows[start : start + used]
+        time = float(imu.time[start + used - 1])
+        if event == 3:
+            self._complain(time, Health.MOVING, "alignment waits: the vehicle moves")
+        elif event:
+            self._judge(time, event == 2)
+        self._progress = 1.0 if self.mode == Mode.NAVIGATE else rest.progress(self._sums, goal)
+        self._fill_constant(part)
+        return used
+
+    def _judge(self, time: float, complete: bool) -> None:
+        mean = rest.means(self._sums)
+        wrong = rest.gravity_verdict(mean.f)
+        if wrong:
+            self._complain(time, Health.UNITS, wrong)
+        self.health &= ~Health.MOVING
+        if not complete:
+            return
+        lat = float(self._state[0])
+        try:
+            if wrong:
+                raise AlignmentRefused(wrong)
+            if self.settings.alignment == "level":
+                result = level(mean.f, mean.w, lat, self.heading or 0.0, mean.sigma_f)
+            else:
+                result = gyrocompass(mean.f, mean.w, lat, mean.sigma_f, mean.sigma_w)
+        except AlignmentRefused as refusal:
+            self._complain(time, Health.UNITS if wrong else Health.RATE_TOO_SMALL, str(refusal))
+            self._sums[:] = 0.0
+            return
+        self.health &= ~(Health.UNITS | Health.RATE_TOO_SMALL)
+        self.gyro_bias = result.gyro_bias
+        self._sums[:] = 0.0
+        self._state[6:10] = result.q_nb
+        self.mode = Mode.NAVIGATE
+        heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(result.q_nb))
+        self._say(
+            time,
+            "info",
+            f"aligned in {mean.time_s:.1f} s: heading {heading:.3f} pitch {pitch:.3f} roll {roll:.3f} deg, "
+            f"{np.linalg.norm(mean.f) / 9.80665:.3f} g",
+        )
+
+    def _navigate(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
+        event = 0
+        if self.settings.track_bias_at_rest:
+            used, event = rest.accumulate(
+                self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], REST_WINDOW_S
+            )
+            stop = start + used
+        n = stop - start
+        position, velocity, attitude = (array[:n] for array in self._scratch)
+        done = geographic.advance(
+            self._state,
+            imu.step[start:stop],
+            imu.dtheta[start:stop],
+            imu.dvel[start:stop],
+            self.gyro_bias,
+            position,
+            velocity,
+            attitude,
+        )
+        if done < n:
+            raise HilError(
+                f"the geographic mechanization is singular at the pole: stopped at latitude "
+                f"{math.degrees(self._state[0]):.4f} deg"
+            )
+        part = rows[start:stop]
+        part["mode"], part["health"] = self.mode, self.health
+        part["lat"], part["lon"], part["height"] = position[:, 0], position[:, 1], position[:, 2]
+        part["vel_n"], part["q_nb"], part["gyro_bias"] = velocity, attitude, self.gyro_bias
+        part["progress"] = 1.0
+        if event == 2:
+            self._track_bias()
+        return n
+
+    def _flag(self, time: float, flagged: bool) -> None:
+        self.health ^= Health.SENSOR
+        if flagged:
+            self._say(time, "error", "the sensor flags its own samples: see its built-in test")
+        self._trust(time)
+
+    def _track_bias(self) -> None:
+        mean = rest.means(self._sums)
+        self._sums[:] = 0.0
+        change = mean.w - earth_rate_in_body(self._state[6:10], float(self._state[0])) - self.gyro_bias
+        if float(np.abs(change).max()) < REST_BIAS_STEP:
+            self.gyro_bias = self.gyro_bias + REST_GAIN * change
+
+    def _meet(self, gap: Gap) -> None:
+        if self.mode in (Mode.INIT, Mode.ALIGN):
+            return
+        what = f"gap of {gap.length_s:.3f} s, {gap.missing} samples"
+        if gap.realign:
+            self.realign(gap.time, what)
+        elif gap.length_s > self.settings.gaps.interpolate_s:
+            self.health |= Health.BRIDGED
+            self._say(gap.time, "warning", f"{what}: bridged, attitude and velocity are no longer exact")
+            self._trust(gap.time)
+
+    def _trust(self, time: float) -> None:
+        if self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
+            mode = Mode.DEGRADED if self.health & DISTRUST else Mode.NAVIGATE
+            if mode != self.mode:
+                self.mode = mode
+                self._say(time, "warning" if mode == Mode.DEGRADED else "info", f"mode {mode.name.lower()}")
+
+    def _complain(self, time: float, health: Health, text: str) -> None:
+        if not self.health & health:
+            self.health |= health
+            self._say(time, "warning", text)
+
+    def _say(self, time: float, severity: Severity, text: str) -> None:
+        self._events.append(Event(time, severity, text))
+
+    def _fill_constant(self, part: StateArray) -> None:
+        part["mode"], part["health"] = self.mode, self.health
+        part["lat"], part["lon"], part["height"] = self._state[0], self._state[1], self._state[2]
+        part["vel_n"], part["q_nb"], part["gyro_bias"] = self._state[3:6], self._state[6:10], self.gyro_bias
+        part["progress"] = self._progress
