@@ -27,7 +27,8 @@ while getopts t:m:w:r: option; do
 done
 shift $((OPTIND - 1))
 [ $# -gt 0 ] || usage
-command=("$@")
+command=("$@") terminal=no
+[ -t 1 ] && terminal=yes
 
 for program in linux.uml busybox; do
   command -v $program >/dev/null ||
@@ -48,7 +49,7 @@ fi
 {
   echo '#!/bin/bash'
   export -p | grep -vE '^declare -x (TMPDIR|OLDPWD|PWD|SHLVL|XDG_RUNTIME_DIR|_)='
-  declare -p cwd writable readable work command
+  declare -p cwd writable readable work command terminal
   cat <<'GUEST'
 PATH=$PATH:/usr/sbin:/sbin
 stty -F /dev/tty1 raw -echo; stty -F /dev/tty2 raw -echo
@@ -86,8 +87,18 @@ done
 
 cd "$cwd"
 trap '' HUP
-"${command[@]}" </dev/null
-echo $? >"$work/code.part"; mv "$work/code.part" "$work/code"; sync
+if [ $terminal = yes ]; then
+  "${command[@]}" </dev/null
+  code=$?
+else # the consoles are terminals: put a pipe between, as the host has one, or there are colours and progress bars in logs
+  exec 3> >(exec cat >/dev/tty1); out=$!
+  exec 4> >(exec cat 3>&- >/dev/tty2); err=$!
+  "${command[@]}" </dev/null >&3 2>&4 3>&- 4>&-
+  code=$?
+  exec 3>&- 4>&-
+  for pid in $out $err; do timeout 2 tail --pid=$pid -s 0.05 -f /dev/null; done # a left process may hold the pipe open
+fi
+echo $code >"$work/code.part"; mv "$work/code.part" "$work/code"; sync
 busybox poweroff -f
 GUEST
 } >"$work/init"
