@@ -1,0 +1,305 @@
+"""Driver of the dual-DTG head: frames of `fixtures/can/dtg_head.dbc`, FD or classic, to `HeadIncrements`.
+
+What is dropped is counted (`drivers.Counters`). The order of samples is judged by the 32-bit counter and the device's
+clock: the next one or a later one is taken (what is missing counts as lost); one of the last 63 that was not seen yet
+comes late, one that was seen is a duplicate, both are dropped; anything else is a head that started anew. Device time is
+unwrapped from its 32 bits of microseconds. A sample after a gap covers one nominal period, not the gap.
+"""
+
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers import Counters
+from drivers.can.codec import MessageCodec, load_database
+from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
+from drivers.can.integrity import Protection, protection
+from nav.errors import HilError
+from nav.increments import FloatArray, HeadIncrements, IntArray, Validity
+from nav.kernel import kernel
+
+PROTOCOL = 1
+"""Version of the message set that this driver reads."""
+FAULTS = 0x03FF
+"""Status bits that make a sample suspect."""
+ROTOR_VALID = 0x8000
+"""Status bit: the rotor angles are there."""
+WINDOW = 64
+"""How far back a sample counts as late or duplicate rather than as a restart."""
+
+CLASSIC = tuple(f"HEAD_C{k}" for k in range(6))
+SLOW = ("HEAD_IDENTITY", "HEAD_CONFIG", "HEAD_TEMPERATURE", "HEAD_ROTOR", "HEAD_BIT")
+# Columns of a sample: protocol, counter, time, status, four increments, four rotor angles, three velocity increments.
+_PROTOCOL, _COUNTER, _TIME, _STATUS, _DTHETA, _ROTOR, _DVEL, _COLUMNS = 0, 1, 2, 3, 4, 8, 12, 15
+_AXES = ("g1x", "g1y", "g2y", "g2z")
+_FD_SIGNALS = (
+    *("protocol", "sample_counter", "device_time", "status"),
+    *(f"dtheta_{axis}" for axis in _AXES),
+    *(f"rotor_{axis}" for axis in _AXES),
+    *("dvel_x", "dvel_y", "dvel_z"),
+)
+# State of the tracker.
+_STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN, _PERIOD_US = range(7)
+# Outcomes of the tracker.
+_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS = range(7)
+
+
+def head_database_text() -> str:
+    """The DBC of the head's message set, the one truth for driver, emulator and firmware."""
+    return (files("fixtures") / "can" / "dtg_head.dbc").read_text("cp1252")
+
+
+@kernel
+def _signed32(value: int) -> int:
+    return (value + 0x80000000) % 0x100000000 - 0x80000000
+
+
+@kernel
+def _track(
+    values: FloatArray,
+    good: NDArray[np.bool_],
+    state: IntArray,
+    outcome: IntArray,
+    time: FloatArray,
+    step: FloatArray,
+    sequence: IntArray,
+    validity: IntArray,
+    rows: IntArray,
+) -> int:
+    """Judge samples by their check, version, counter and time; the accepted ones go to the front of the outputs."""
+    n = 0
+    for k in range(values.shape[0]):
+        if not good[k]:
+            outcome[_CRC] += 1
+            continue
+        if values[k, _PROTOCOL] != PROTOCOL:
+            outcome[_VERSION] += 1
+            continue
+        counter, us = int(values[k, _COUNTER]), int(values[k, _TIME])
+        delta = _signed32(counter - state[_LAST_COUNTER])
+        elapsed = _signed32(us - state[_LAST_US])
+        period = state[_PERIOD_US]
+        if state[_STARTED] == 0:
+            state[_STARTED] = 1
+            state[_SEQUENCE], state[_TIME_US] = counter, us
+            state[_SEEN] = 1
+            step_us = float(period)
+        elif delta > 0 and elapsed > 0:
+            outcome[_LOST] += delta - 1
+            state[_SEQUENCE] += delta
+            state[_TIME_US] += elapsed
+            state[_SEEN] = (state[_SEEN] << delta) | 1 if delta < WINDOW else 1
+            step_us = float(elapsed) if delta == 1 else float(period) if period > 0 else elapsed / delta
+        elif -WINDOW < delta <= 0 and elapsed <= 0:
+            if (state[_SEEN] >> -delta) & 1:
+                outcome[_DUPLICATED] += 1
+            else:
+                state[_SEEN] |= 1 << -delta
+                outcome[_LATE] += 1
+                outcome[_LOST] -= 1
+            continue
+        else:
+            outcome[_RESTARTS] += 1
+            state[_SEQUENCE] += 2  # any jump: the navigator sees that time does not go on
+            state[_TIME_US] = us
+            state[_SEEN] = 1
+            step_us = float(period)
+        state[_LAST_COUNTER], state[_LAST_US] = counter, us
+        if step_us <= 0.0:  # the first sample of a head that has not said its period: it only sets the clock
+            continue
+        time[n], step[n] = state[_TIME_US] * 1e-6, step_us * 1e-6
+        sequence[n] = state[_SEQUENCE]
+        validity[n] = Validity.SENSOR.value if int(values[k, _STATUS]) & FAULTS else 0
+        rows[n] = k
+        n += 1
+    outcome[_SAMPLES] += n
+    return n
+
+
+@kernel
+def _join(
+    kind: IntArray, data: NDArray[np.uint8], partial: NDArray[np.uint8], state: IntArray, joined: NDArray[np.uint8], last: IntArray
+) -> tuple[int, int]:
+    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames)."""
+    n = duplicates = 0
+    for k in range(kind.shape[0]):
+        if kind[k] < 0:
+            continue
+        number = data[k, 1] & 0x0F
+        bit = 1 << kind[k]
+        if number != state[0]:
+            state[0], state[1] = number, 0
+        if state[1] & bit:
+            duplicates += 1
+            continue
+        state[1] |= bit
+        for i in range(8):
+            partial[kind[k], i] = data[k, i]
+        if state[1] == 0x3F:
+            for j in range(6):
+                for i in range(8):
+                    joined[n, j, i] = partial[j, i]
+            last[n] = k
+            n += 1
+            state[0], state[1] = -1, 0
+    return n, duplicates
+
+
+class DtgHead:
+    """See the module; satisfies `drivers.FrameDriver`."""
+
+    def __init__(self) -> None:
+        database = load_database(head_database_text())
+        self._sample = database["HEAD_SAMPLE"]
+        self._classic = [database[name] for name in CLASSIC]
+        self._slow = {database[name].can_id: database[name] for name in SLOW}
+        self._protection: dict[str, Protection] = {}
+        for name in ("HEAD_SAMPLE", *CLASSIC, *SLOW):
+            declared = protection(database[name])
+            if declared is None:
+                raise HilError(f"dtg_head.dbc: message {name} has no E2EProfile")
+            self._protection[name] = declared
+        self._columns = np.array([self._sample.columns[name] for name in _FD_SIGNALS])
+        self._kinds = {codec.can_id: k for k, codec in enumerate(self._classic)}
+        self.counters = Counters()
+        self.period_s: float | None = None
+        self.world_id = 0
+        self._identity: dict[str, object] = {}
+        self._state = np.zeros(7, np.int64)
+        self._outcome = np.zeros(7, np.int64)
+        self._partial = np.zeros((6, 8), np.uint8)
+        self._partial_state = np.array([-1, 0], np.int64)
+        self._arrivals: IntArray = np.zeros(0, np.int64)
+        self._room(1024)
+
+    def _room(self, n: int) -> None:
+        self._batch = HeadIncrements.empty(n)
+        self._data = np.zeros((n, 64), np.uint8)
+        self._raw = np.zeros((n, len(self._sample.signals)))
+        self._values = np.zeros((n, _COLUMNS))
+        self._good = np.zeros(n, np.bool_)
+        self._rows = np.zeros(n, np.int64)
+
+    def identity(self) -> dict[str, object]:
+        """Serial, hardware, sample period, temperatures, rotor speeds, supply and built-in test, as last heard."""
+        return dict(self._identity)
+
+    def arrivals(self) -> IntArray:
+        """Arrival (ns) of the last frame of each sample of the last `decode`."""
+        return self._arrivals
+
+    def decode(self, batch: FrameArray) -> HeadIncrements:
+        """The samples that `batch` completes, in order; valid until the next call."""
+        n = len(batch)
+        if n > len(self._batch):
+            self._room(2 * n)
+        self.counters.frames += n
+        ids = batch["can_id"]
+        is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
+        if is_sample.all():
+            self._data[:n] = batch["data"]
+            return self._samples(n, batch["time_ns"])
+        self._others(batch[~is_sample])
+        chosen = batch[is_sample]
+        if len(chosen):
+            self._data[: len(chosen)] = chosen["data"]
+            return self._samples(len(chosen), chosen["time_ns"])
+        return self._classic_samples(batch)
+
+    def _samples(self, n: int, times: IntArray) -> HeadIncrements:
+        data = self._data[:n]
+        self._protection["HEAD_SAMPLE"].check(data, self._good[:n])
+        self._sample.decode(data, self._raw[:n])
+        self._values[:n] = self._raw[:n, self._columns]
+        return self._accept(n, times)
+
+    def _accept(self, n: int, times: IntArray) -> HeadIncrements:
+        batch, values = self._batch, self._values[:n]
+        count = _track(
+            values,
+            self._good[:n],
+            self._state,
+            self._outcome,
+            batch.time,
+            batch.step,
+            batch.sequence,
+            batch.validity,
+            self._rows,
+        )
+        rows = self._rows[:count]
+        result = batch.rows(0, count)
+        kept = values[rows]
+        result.dtheta[:] = kept[:, _DTHETA : _DTHETA + 4]
+        result.rotor[:] = kept[:, _ROTOR : _ROTOR + 4]
+        result.dvel[:] = kept[:, _DVEL : _DVEL + 3]
+        invalid = (kept[:, _STATUS].astype(np.int64) & ROTOR_VALID) == 0
+        if invalid.any():
+            result.rotor[invalid] = np.nan
+        self._arrivals = times[rows]
+        counters, outcome = self.counters, self._outcome
+        counters.samples, counters.lost, counters.late = int(outcome[_SAMPLES]), int(outcome[_LOST]), int(outcome[_LATE])
+        counters.restarts = int(outcome[_RESTARTS])
+        counters.duplicated += int(outcome[_DUPLICATED])
+        counters.crc_errors += int(outcome[_CRC])
+        counters.version_errors += int(outcome[_VERSION])
+        outcome[_DUPLICATED] = outcome[_CRC] = outcome[_VERSION] = 0
+        return result
+
+    def _others(self, batch: FrameArray) -> None:
+        """Count what is not a sample and read the slow frames."""
+        for row in batch:
+            can_id, length = int(row["can_id"]), int(row["length"])
+            if can_id in self._kinds and length == 8:
+                continue
+            codec = self._slow.get(can_id)
+            if codec is not None and length == 8:
+                self._read_slow(codec, row["data"][None, :8])
+            elif can_id & ERR or can_id & RTR or can_id & EFF or not self._is_ours(can_id):
+                self.counters.foreign += 1
+            else:
+                self.counters.short += 1
+
+    def _is_ours(self, can_id: int) -> bool:
+        return can_id == self._sample.can_id or can_id in self._kinds or can_id in self._slow
+
+    def _read_slow(self, codec: MessageCodec, data: NDArray[np.uint8]) -> None:
+        if not self._protection[codec.name].check(np.ascontiguousarray(data), np.zeros(1, np.bool_))[0]:
+            self.counters.crc_errors += 1
+            return
+        said = codec.unpack(data.tobytes())
+        if codec.name == "HEAD_IDENTITY" and said["protocol"] != PROTOCOL:
+            self.counters.version_errors += 1
+            return
+        if codec.name == "HEAD_CONFIG":
+            self.world_id = int(said["world_id"])
+            self._state[_PERIOD_US] = int(said["sample_period"])
+            self.period_s = said["sample_period"] * 1e-6
+        self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
+
+    def _classic_samples(self, batch: FrameArray) -> HeadIncrements:
+        ids, eight = batch["can_id"], batch["length"] == 8
+        kind = np.full(len(batch), -1, np.int64)
+        data = np.ascontiguousarray(batch["data"][:, :8])
+        for can_id, k in self._kinds.items():
+            chosen = np.flatnonzero((ids == can_id) & eight)
+            if len(chosen):
+                good = self._protection[CLASSIC[k]].check(data[chosen], np.zeros(len(chosen), np.bool_))
+                self.counters.crc_errors += int(len(chosen) - good.sum())
+                kind[chosen[good]] = k
+        joined = np.zeros((len(batch) // 6 + 1, 6, 8), np.uint8)
+        last = np.zeros(len(joined), np.int64)
+        n, duplicates = _join(kind, data, self._partial, self._partial_state, joined, last)
+        self.counters.duplicated += duplicates
+        part = {}
+        for k, codec in enumerate(self._classic):
+            decoded = codec.decode(np.ascontiguousarray(joined[:n, k]), np.zeros((n, len(codec.signals))))
+            part.update({name: decoded[:, column] for name, column in codec.columns.items()})
+        values = self._values[:n]
+        for column, name in enumerate(_FD_SIGNALS):
+            if name.startswith("dvel"):
+                values[:, column] = part[f"{name}_lo"] + part[f"{name}_hi"]
+            else:
+                values[:, column] = part.get(name, 0.0)
+        self._good[:n] = True
+        return self._accept(n, batch["time_ns"][last[:n]])

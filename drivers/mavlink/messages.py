@@ -1,0 +1,238 @@
+"""Navigation solutions to MAVLink messages: pure functions, and the table of what is sent how often.
+
+Each function takes a `Solution` and the `Situation` around it and returns the message, or None when the solution does
+not hold what the message needs (no attitude yet, a number that is not one). Units are those of the message definition;
+altitudes are above mean sea level, times are device time.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from drivers.mavlink.solution import Home, Solution
+from nav.state import Health, Mode
+
+Message = Any
+"""A message of pymavlink, which has no type information."""
+
+VEHICLES = {
+    "fixed-wing": mav.MAV_TYPE_FIXED_WING,
+    "quadrotor": mav.MAV_TYPE_QUADROTOR,
+    "helicopter": mav.MAV_TYPE_HELICOPTER,
+    "ground-rover": mav.MAV_TYPE_GROUND_ROVER,
+    "surface-boat": mav.MAV_TYPE_SURFACE_BOAT,
+    "generic": mav.MAV_TYPE_GENERIC,
+}
+"""Names of the vehicle types that a user may choose."""
+
+_SYSTEM_STATUS = {
+    Mode.INIT: mav.MAV_STATE_BOOT,
+    Mode.ALIGN: mav.MAV_STATE_CALIBRATING,
+    Mode.NAVIGATE: mav.MAV_STATE_ACTIVE,
+    Mode.DEGRADED: mav.MAV_STATE_CRITICAL,
+}
+_GYRO = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
+_ACCEL = mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+_AHRS = mav.MAV_SYS_STATUS_AHRS
+_ACCEL_AND_GYRO_UPDATED = 0b111111
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a message says beside the solution."""
+
+    vehicle_type: int = mav.MAV_TYPE_FIXED_WING
+    home: Home | None = None
+    lost: int = 0
+    """Sensor samples lost since the start."""
+    samples: int = 0
+    """Sensor samples received since the start."""
+
+
+def heartbeat(solution: Solution, situation: Situation) -> Message:
+    """HEARTBEAT of a navigation unit that is no autopilot: generic, never armed."""
+    status = _SYSTEM_STATUS[solution.mode]
+    return mav.MAVLink_heartbeat_message(situation.vehicle_type, mav.MAV_AUTOPILOT_GENERIC, 0, 0, status, 3)
+
+
+def sys_status(solution: Solution, situation: Situation) -> Message:
+    """SYS_STATUS: a sensor is enabled once it should work, so that a client sees a fault only where there is one.
+
+    The geofence bit is healthy and not present: some clients announce a breach without it.
+    """
+    enabled = 0 if solution.mode == Mode.INIT else _GYRO | _ACCEL
+    if solution.mode in (Mode.NAVIGATE, Mode.DEGRADED):
+        enabled |= _AHRS
+    healthy = mav.MAV_SYS_STATUS_GEOFENCE
+    if not solution.health & (Health.SILENT | Health.SENSOR):
+        healthy |= _GYRO if solution.health & Health.UNITS else _GYRO | _ACCEL
+    if solution.mode == Mode.NAVIGATE:
+        healthy |= _AHRS
+    total = situation.lost + situation.samples
+    return mav.MAVLink_sys_status_message(
+        onboard_control_sensors_present=_GYRO | _ACCEL | _AHRS,
+        onboard_control_sensors_enabled=enabled,
+        onboard_control_sensors_health=healthy,
+        load=0,
+        voltage_battery=65535,
+        current_battery=-1,
+        battery_remaining=-1,
+        drop_rate_comm=_integer(10000.0 * situation.lost / total, 0, 10000) if total > 0 else 0,
+        errors_comm=min(max(situation.lost, 0), 65535),
+        errors_count1=0,
+        errors_count2=0,
+        errors_count3=0,
+        errors_count4=0,
+    )
+
+
+def system_time(solution: Solution, _: Situation) -> Message | None:
+    """SYSTEM_TIME: host time (UTC) at which the sample of this device time arrived."""
+    if not solution.has_imu:
+        return None
+    return mav.MAVLink_system_time_message(max(solution.arrival_ns, 0) // 1000, _boot_ms(solution))
+
+
+def attitude(solution: Solution, _: Situation) -> Message | None:
+    """ATTITUDE: Euler angles, and the body's rates relative to the local level."""
+    if not solution.has_position:  # the rates of the local level need it
+        return None
+    heading, pitch, roll = solution.euler
+    yaw = heading - 2.0 * math.pi if heading > math.pi else heading
+    return mav.MAVLink_attitude_message(_boot_ms(solution), roll, pitch, yaw, *solution.w_nb_b)
+
+
+def attitude_quaternion(solution: Solution, _: Situation) -> Message | None:
+    """ATTITUDE_QUATERNION: q_nb, no offset for display."""
+    if not solution.has_position:
+        return None
+    return mav.MAVLink_attitude_quaternion_message(
+        _boot_ms(solution), *solution.q_nb, *solution.w_nb_b, repr_offset_q=[1.0, 0.0, 0.0, 0.0]
+    )
+
+
+def global_position_int(solution: Solution, situation: Situation) -> Message | None:
+    """GLOBAL_POSITION_INT: altitude above mean sea level and above home."""
+    if not solution.has_position:
+        return None
+    lat, lon = _degrees_e7(solution.lat, solution.lon)
+    north, east, down = (_integer(100.0 * v, -32767, 32767) for v in solution.vel_n)
+    hdg = _integer(math.degrees(solution.euler[0]) * 100.0, 0, 36000) % 36000
+    above_home = solution.height - situation.home.height if situation.home else 0.0
+    return mav.MAVLink_global_position_int_message(
+        _boot_ms(solution), lat, lon, _millimetres(solution.altitude), _millimetres(above_home), north, east, down, hdg
+    )
+
+
+def local_position_ned(solution: Solution, situation: Situation) -> Message | None:
+    """LOCAL_POSITION_NED: relative to home."""
+    if not solution.has_position or situation.home is None:
+        return None
+    return mav.MAVLink_local_position_ned_message(
+        _boot_ms(solution), *solution.relative_to(situation.home), *solution.vel_n
+    )
+
+
+def vfr_hud(solution: Solution, _: Situation) -> Message | None:
+    """VFR_HUD: no airspeed (there are no air data), no throttle."""
+    if not solution.has_position:
+        return None
+    north, east, down = solution.vel_n
+    heading_deg = _integer(math.degrees(solution.euler[0]), 0, 360) % 360
+    return mav.MAVLink_vfr_hud_message(0.0, math.hypot(north, east), heading_deg, 0, solution.altitude, -down)
+
+
+def highres_imu(solution: Solution, _: Situation) -> Message | None:
+    """HIGHRES_IMU: specific force and rate of the body, inertial."""
+    if not solution.has_imu:
+        return None
+    return mav.MAVLink_highres_imu_message(
+        _boot_us(solution), *solution.f_b, *solution.w_ib_b, *([0.0] * 7), fields_updated=_ACCEL_AND_GYRO_UPDATED
+    )
+
+
+def altitude(solution: Solution, situation: Situation) -> Message | None:
+    """ALTITUDE: terrain unknown."""
+    if not solution.has_position:
+        return None
+    above_home = local = 0.0
+    if situation.home is not None:
+        above_home = solution.height - situation.home.height
+        local = -solution.relative_to(situation.home)[2]
+    return mav.MAVLink_altitude_message(
+        _boot_us(solution), solution.height, solution.altitude, local, above_home, -1001.0, -1.0
+    )
+
+
+def home_position(solution: Solution, situation: Situation) -> Message | None:
+    """HOME_POSITION: where navigation began."""
+    home = situation.home
+    if home is None:
+        return None
+    altitude_m = home.height - solution.geoid(home.lat, home.lon)
+    return mav.MAVLink_home_position_message(
+        *_degrees_e7(home.lat, home.lon), _millimetres(altitude_m), 0.0, 0.0, 0.0, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0
+    )
+
+
+def gps_raw_int(solution: Solution, _: Situation) -> Message | None:
+    """GPS_RAW_INT: there is no satellite receiver, and the message says so."""
+    if not solution.has_imu:
+        return None
+    unknown = 65535
+    return mav.MAVLink_gps_raw_int_message(
+        _boot_us(solution), mav.GPS_FIX_TYPE_NO_GPS, 0, 0, 0, unknown, unknown, unknown, unknown, 255
+    )
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One message of the table."""
+
+    build: Callable[[Solution, Situation], Message | None]
+    rate_hz: float
+    parameter: str
+    """Name of the parameter that holds the rate."""
+    from_solution: bool = True
+    """Sent only with a new solution; otherwise by time alone."""
+
+
+KINDS = {
+    "ATTITUDE": Kind(attitude, 50.0, "SR_ATT_HZ"),
+    "ATTITUDE_QUATERNION": Kind(attitude_quaternion, 25.0, "SR_QUAT_HZ"),
+    "HIGHRES_IMU": Kind(highres_imu, 25.0, "SR_IMU_HZ"),
+    "GLOBAL_POSITION_INT": Kind(global_position_int, 10.0, "SR_GPOS_HZ"),
+    "LOCAL_POSITION_NED": Kind(local_position_ned, 10.0, "SR_LPOS_HZ"),
+    "VFR_HUD": Kind(vfr_hud, 5.0, "SR_HUD_HZ"),
+    "ALTITUDE": Kind(altitude, 5.0, "SR_ALT_HZ"),
+    "SYSTEM_TIME": Kind(system_time, 1.0, "SR_TIME_HZ"),
+    "GPS_RAW_INT": Kind(gps_raw_int, 1.0, "SR_GPS_HZ"),
+    "SYS_STATUS": Kind(sys_status, 2.0, "SR_SYS_HZ", from_solution=False),
+    "HOME_POSITION": Kind(home_position, 0.2, "SR_HOME_HZ", from_solution=False),
+    "HEARTBEAT": Kind(heartbeat, 1.0, "SR_BEAT_HZ", from_solution=False),
+}
+"""Every message that is sent at a rate, most urgent first."""
+
+
+def _boot_ms(solution: Solution) -> int:
+    return round(solution.time * 1e3) % 2**32
+
+
+def _boot_us(solution: Solution) -> int:
+    return round(solution.time * 1e6) % 2**64
+
+
+def _integer(value: float, lowest: int, highest: int) -> int:
+    return min(max(round(value), lowest), highest)
+
+
+def _millimetres(metres: float) -> int:
+    return _integer(1000.0 * metres, -(2**31), 2**31 - 1)
+
+
+def _degrees_e7(lat: float, lon: float) -> tuple[int, int]:
+    lon_deg = math.degrees(math.remainder(lon, 2.0 * math.pi))
+    return _integer(math.degrees(lat) * 1e7, -900_000_000, 900_000_000), round(lon_deg * 1e7)

@@ -1,0 +1,139 @@
+"""One navigation solution as MAVLink needs it: plain numbers, and what follows from them, each worked out once.
+
+Frames and units as in :mod:`nav`.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from nav.earth import E2, RATE, A
+from nav.rotation import euler_from_quaternion
+from nav.state import Health, Mode
+
+Vector = tuple[float, float, float]
+Undulation = Callable[[float, float], float]
+"""(lat, lon), rad, to the height of the geoid above the ellipsoid, m."""
+
+_LARGEST = 1e30
+"""Larger than any quantity and within single precision."""
+_LATEST_S = 9e9
+"""Nanoseconds up to here fit 64 bits."""
+
+
+@dataclass(frozen=True)
+class Home:
+    """The place that relative positions refer to."""
+
+    lat: float
+    lon: float
+    height: float
+
+
+@dataclass(frozen=True)
+class Solution:
+    """One row of `NAV_STATE`."""
+
+    time: float
+    arrival_ns: int
+    mode: Mode
+    health: Health
+    lat: float
+    lon: float
+    height: float
+    vel_n: Vector
+    q_nb: tuple[float, float, float, float]
+    w_ib_b: Vector
+    f_b: Vector
+    geoid: Undulation
+
+    @classmethod
+    def of(cls, row: Any, geoid: Undulation) -> "Solution":
+        """The solution in `row`, one record of `NAV_STATE`."""
+        time, _, arrival_ns, _, mode, health, lat, lon, height, vel_n, q_nb, w_ib_b, f_b, _, _ = row.item()
+        return cls(
+            time,
+            arrival_ns,
+            Mode(mode),
+            Health(health),
+            lat,
+            lon,
+            height,
+            tuple(vel_n.tolist()),
+            tuple(q_nb.tolist()),
+            tuple(w_ib_b.tolist()),
+            tuple(f_b.tolist()),
+            geoid,
+        )
+
+    @cached_property
+    def has_imu(self) -> bool:
+        """Whether rate, specific force and time are usable numbers."""
+        return _usable(self.time, *self.w_ib_b, *self.f_b) and 0.0 <= self.time < _LATEST_S
+
+    @cached_property
+    def has_attitude(self) -> bool:
+        """Whether there is an attitude: none before the alignment has found one."""
+        return self.has_imu and _usable(*self.q_nb) and abs(sum(x * x for x in self.q_nb) - 1.0) < 0.01
+
+    @cached_property
+    def has_position(self) -> bool:
+        """Whether position and velocity are usable and stand for something."""
+        return self.has_attitude and _usable(self.lat, self.lon, self.height, *self.vel_n)
+
+    @cached_property
+    def euler(self) -> Vector:
+        """Heading [0, 2 pi), pitch, roll, rad."""
+        heading, pitch, roll = euler_from_quaternion(np.array(self.q_nb))
+        return heading, pitch, roll
+
+    @cached_property
+    def altitude(self) -> float:
+        """Height above mean sea level, m."""
+        return self.height - self.geoid(self.lat, self.lon)
+
+    @cached_property
+    def w_nb_b(self) -> Vector:
+        """Rate of the body relative to the local level, body axes, rad/s: Earth and transport rate taken off."""
+        s, c = math.sin(self.lat), math.cos(self.lat)
+        w2 = 1.0 - E2 * s * s
+        prime = A / math.sqrt(w2)
+        east = self.vel_n[1] / (prime + self.height)
+        north = self.vel_n[0] / (prime * (1.0 - E2) / w2 + self.height)
+        turn = east * s / c if abs(c) > 1e-3 else 0.0
+        w, x, y, z = self.q_nb
+        p, q, r = _rotated((w, -x, -y, -z), (RATE * c + east, -north, -RATE * s - turn))
+        return self.w_ib_b[0] - p, self.w_ib_b[1] - q, self.w_ib_b[2] - r
+
+    def relative_to(self, home: Home) -> Vector:
+        """Position north, east, down of `home` in its local level, m."""
+        dx, dy, dz = (a - b for a, b in zip(_ecef(self.lat, self.lon, self.height), _ecef_of(home), strict=True))
+        s, c = math.sin(home.lat), math.cos(home.lat)
+        sl, cl = math.sin(home.lon), math.cos(home.lon)
+        outward = cl * dx + sl * dy
+        return c * dz - s * outward, cl * dy - sl * dx, -(c * outward + s * dz)
+
+
+def _usable(*values: float) -> bool:
+    return all(abs(value) < _LARGEST for value in values)  # False for NaN too
+
+
+def _ecef_of(home: Home) -> Vector:
+    return _ecef(home.lat, home.lon, home.height)
+
+
+def _ecef(lat: float, lon: float, height: float) -> Vector:
+    s, c = math.sin(lat), math.cos(lat)
+    prime = A / math.sqrt(1.0 - E2 * s * s)
+    level = (prime + height) * c
+    return level * math.cos(lon), level * math.sin(lon), (prime * (1.0 - E2) + height) * s
+
+
+def _rotated(q: tuple[float, float, float, float], v: Vector) -> Vector:
+    w, x, y, z = q
+    tx, ty, tz = 2.0 * (y * v[2] - z * v[1]), 2.0 * (z * v[0] - x * v[2]), 2.0 * (x * v[1] - y * v[0])
+    return v[0] + w * tx + y * tz - z * ty, v[1] + w * ty + z * tx - x * tz, v[2] + w * tz + x * ty - y * tx

@@ -1,0 +1,348 @@
+"""The loop: frames in, solutions into the ring. It owns its process, blocks on the bus only, and never formats or logs.
+
+    source -> driver -> head compensation -> navigator -> lever arm -> ring (publisher, status line, dashboard)
+                                                                 \\-> frames ring (recorder)
+
+Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched. What the loop does on
+its own account (silence, an ordered alignment) goes into the recording as an event, so that a replay repeats it.
+"""
+
+import gc
+import math
+import signal
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers import FrameDriver, make_driver
+from drivers.can.frames import FrameArray, frames
+from drivers.clock import ClockMap
+from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
+from hil.control import Control
+from hil.reference import Reference, Trace
+from hil.ring import Ring
+from hil.scenario import Scenario
+from hil.source import BusSource, FileSource, Source
+from hil.stats import Phase, Stats
+from hil.warmup import warm_loop
+from hil.world.truth import TruthKeeper
+from nav.errors import HilError
+from nav.gaps import GapPolicy
+from nav.increments import HeadIncrements, ImuIncrements, Validity
+from nav.instruments.head import HeadCombiner
+from nav.lever_arm import shift
+from nav.navigator import Navigator, Settings
+from nav.rotation import dcm_from_quaternion, quaternion_from_euler
+from nav.state import NAV_STATE, Mode
+
+BATCH = 1024
+"""Most frames taken at once."""
+TICK_S = 0.02
+"""Longest wait for a frame."""
+EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
+"""A message for the user, as it lies in the ring of events."""
+_COUNTED = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors", "restarts")
+
+
+@dataclass(frozen=True, slots=True)
+class LoopOrder:
+    """What the loop shall do; picklable.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Everything the user chose.
+    file : Path, optional
+        Take frames from this recording and not from the scenario's bus.
+    paced : bool
+        Real time; False: as fast as it goes, lossless.
+    reference : Reference, optional
+        An attitude to compare with (another estimator's, from a log).
+    """
+
+    scenario: Scenario
+    file: Path | None = None
+    paced: bool = True
+    reference: Reference | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outlets:
+    """The loop's shared memory; picklable to a spawned process."""
+
+    states: Ring
+    frames: Ring
+    events: Ring
+    stats: Stats = field(default_factory=Stats)
+    control: Control = field(default_factory=Control)
+    recording: bool = False
+
+    @staticmethod
+    def make(*, recording: bool, readers: int) -> "Outlets":
+        """New rings, with `readers` wake-ups for solutions and one for frames."""
+        from drivers.can.frames import FRAME
+
+        return Outlets(
+            Ring(NAV_STATE, 8192, readers), Ring(FRAME, 1 << 16, 1), Ring(EVENTS, 256, 1), recording=recording
+        )
+
+
+def settings_of(scenario: Scenario) -> Settings:
+    """The navigator's settings in a scenario."""
+    navigation, start, motion = scenario.navigation, scenario.navigation.start, scenario.motion
+    latitude = motion.latitude_deg if start.latitude_deg is None else start.latitude_deg
+    longitude = motion.longitude_deg if start.longitude_deg is None else start.longitude_deg
+    return Settings(
+        lat=math.radians(latitude),
+        lon=math.radians(longitude),
+        height=motion.height_m if start.height_m is None else start.height_m,
+        alignment="level" if navigation.alignment == "level" else "gyrocompass",
+        align_s=navigation.align_s,
+        heading=None if start.heading_deg is None else math.radians(start.heading_deg),
+        track_bias_at_rest=navigation.track_bias_at_rest,
+        position_trusted=navigation.alignment != "level",
+        attitude=navigation.attitude,
+        mechanization=navigation.mechanization,
+        gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
+    )
+
+
+class Loop:
+    """The state of one run: driver, navigator and what is counted."""
+
+    def __init__(self, order: LoopOrder, outlets: Outlets) -> None:
+        scenario = order.scenario
+        self.scenario = scenario
+        self.driver: FrameDriver = make_driver(scenario.driver)
+        self.navigator = Navigator(settings_of(scenario))
+        self.finished = False
+        """The scenario's duration is over."""
+        head = scenario.head
+        self._arm = -np.asarray(head.lever_arm_m)
+        self._combiner = HeadCombiner(dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))))
+        self._outlets = outlets
+        self._live = order.paced and order.file is None
+        self._truth: TruthKeeper | None = None
+        self._from_truth = scenario.navigation.alignment == "truth"
+        self._trace = Trace() if order.reference is not None else None
+        self._reference = order.reference
+        self._clock = ClockMap()
+        self._restarts = 0
+        self._started: float | None = None
+        self._align_requests = outlets.control.align_requests
+        self._world = scenario.world_id()
+
+    def take(self, batch: FrameArray) -> bool:
+        """Decode and navigate a batch of frames; True when it held a sample."""
+        driver, got, start = self.driver, False, 0
+        while driver.period_s is None and start < len(batch):  # one by one until the board has said what it is
+            got = self._take(batch[start : start + 1]) or got
+            start += 1
+        return (self._take(batch[start:]) if start < len(batch) else False) or got
+
+    def _take(self, batch: FrameArray) -> bool:
+        driver = self.driver
+        raw = driver.decode(batch)
+        self._count()
+        if len(raw) == 0:
+            return False
+        if driver.counters.restarts != self._restarts:
+            self._restarts = driver.counters.restarts
+            self._clock.reset()
+            self._started = None
+        arrivals = driver.arrivals()
+        raw = self._cut(raw)
+        if self._truth is None and driver.world_id == self._world:
+            self._truth = TruthKeeper(self.scenario)
+        if self._from_truth and not self._begin(raw):
+            return True
+        imu = self._combiner.combine(raw) if isinstance(raw, HeadIncrements) else raw
+        rows = self.navigator.process(imu)
+        if self._arm.any():
+            position = rows["lat"], rows["lon"], rows["height"]
+            shift(*position, rows["vel_n"], rows["q_nb"], rows["w_ib_b"], self._arm)
+        rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
+        self._publish(rows)
+        stats = self._outlets.stats
+        if self._live:
+            stats.add_latencies(time.time_ns() - arrivals)
+            stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
+        made_up = np.count_nonzero(rows["sequence"]) - len(imu) if len(rows) != len(imu) else 0
+        if made_up:
+            stats["interpolated"] += made_up
+        return True
+
+    def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
+        """Up to the scenario's duration, counted from the first sample."""
+        if self._started is None:
+            self._started = float(raw.time[0] - raw.step[0])
+            self._outlets.stats["started_us"] = round(self._started * 1e6)
+        duration = self.scenario.duration_s
+        if duration is not None:
+            end = self._started + duration + 1e-9
+            if raw.time[-1] >= end - raw.step[-1]:
+                self.finished = True
+                return raw.rows(0, int(np.searchsorted(raw.time, end, "right")))
+        return raw
+
+    def _begin(self, raw: HeadIncrements | ImuIncrements) -> bool:
+        """Start from the truth; False while the head's world is not known to be ours."""
+        if self._truth is None:
+            if self.driver.world_id:
+                raise HilError(
+                    'navigation.alignment = "truth" needs the head of this very scenario on the bus; '
+                    "the head there simulates another world"
+                )
+            return False
+        truth = self._truth.motion.truth(np.array([raw.time[0] - raw.step[0]]))
+        if self._arm.any():
+            position = truth["lat"], truth["lon"], truth["height"]
+            shift(*position, truth["vel_n"], truth["q_nb"], truth["w_ib_b"], -self._arm)
+        row = truth[0]
+        start = float(raw.time[0] - raw.step[0])
+        self.navigator.begin(row["lat"], row["lon"], row["height"], row["vel_n"], row["q_nb"], start)
+        self._from_truth = False
+        return True
+
+    def obey(self, event: int) -> None:
+        """Repeat an event: silence, or an ordered alignment."""
+        if event == SILENCE:
+            self._publish(self.navigator.silent())
+            self._outlets.stats["silences"] += 1
+        elif event == REALIGN:
+            self.navigator.realign(self._last_time(), "ordered")
+
+    def ordered_event(self) -> int:
+        """An alignment that another process has ordered since the last look; 0 for none."""
+        requests = self._outlets.control.align_requests
+        if requests == self._align_requests:
+            return 0
+        self._align_requests = requests
+        return REALIGN
+
+    def _last_time(self) -> float:
+        row = np.zeros(1, NAV_STATE)
+        return float(row["time"][0]) if self._outlets.states.latest(row) else 0.0
+
+    def _publish(self, rows: NDArray[Any]) -> None:
+        outlets = self._outlets
+        rows["solution_ns"] = time.time_ns()
+        outlets.states.push(rows)
+        for event in self.navigator.events():
+            note = np.zeros(1, EVENTS)
+            note["time"], note["severity"], note["text"] = event.time, event.severity.encode(), event.text.encode()[:240]
+            outlets.events.push(note)
+        if self._truth is not None and len(rows):
+            self._truth.compare(rows)
+            outlets.stats["position_error_mm"] = round(min(self._truth.position.final, 1e12) * 1000.0)
+        if self._trace is not None:
+            self._trace.add(rows)
+
+    def _count(self) -> None:
+        stats, counters = self._outlets.stats, self.driver.counters
+        for name in _COUNTED:
+            stats[name] = getattr(counters, name)
+        self._outlets.control.set_loss(counters.lost, counters.samples)
+
+    def result(self) -> dict[str, Any]:
+        """What the summary needs beyond the shared counters."""
+        result: dict[str, Any] = {
+            "mode": self.navigator.mode.name.lower(),
+            "gyro_bias_deg_h": [float(b) for b in np.degrees(self.navigator.gyro_bias) * 3600.0],
+            "head": self.driver.identity(),
+        }
+        if self._truth is not None and (error := self._truth.summary()) is not None:
+            result["error"] = error
+        if self._trace is not None and self._reference is not None:
+            result.update(self._reference.differences(self._trace))
+        return result
+
+
+def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
+    """Target of the loop's process: runs until told to stop, the duration is over or the source is exhausted.
+
+    Sends through `answer` a dict: the result, or ``{"failed": message}``.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    stats = outlets.stats
+    try:
+        warm_loop(order.scenario, lambda done: stats.__setitem__("warm_loop", done))
+        loop = Loop(order, outlets)
+        source: Source = (
+            FileSource(order.file, paced=order.paced)
+            if order.file is not None
+            else BusSource(order.scenario.bus, paced=order.paced)
+        )
+        try:
+            gc.collect()
+            gc.freeze()
+            stats["phase"] = Phase.READY
+            _run(loop, source, order, outlets)
+        finally:
+            source.close()
+        result = loop.result()
+        if source.problem():
+            result["problem"] = source.problem()
+        stats["phase"] = Phase.DONE
+        answer.send(result)
+    except HilError as error:
+        stats["phase"] = Phase.FAILED
+        answer.send({"failed": str(error)})
+    finally:
+        answer.close()
+
+
+def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None:
+    batch = frames(BATCH)
+    silence_ns = round(order.scenario.navigation.silence_s * 1e9)
+    wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
+    heard: int | None = None
+    stats, control = outlets.stats, outlets.control
+    while not (control.stop or loop.finished or source.exhausted):
+        n = source.receive(batch, wait)
+        now = time.monotonic_ns()
+        stats["beat_ns"] = now
+        if n:
+            taken = batch[:n]
+            _record(taken, outlets, order.paced)
+            if order.file is not None and taken["reserved"][:, 0].any():
+                got = _take_with_events(loop, taken)
+            else:
+                got = loop.take(taken)
+            if got:
+                heard = now
+                stats["phase"] = Phase.RUNNING
+        event = loop.ordered_event()
+        if source.live and heard is not None and now - heard > silence_ns:
+            heard = None
+            event = event or SILENCE
+        if event:
+            _record(event_record(event, time.time_ns()), outlets, order.paced)
+            loop.obey(event)
+
+
+def _take_with_events(loop: Loop, taken: FrameArray) -> bool:
+    got, start = False, 0
+    for mark in np.flatnonzero(taken["reserved"][:, 0] == EVENT):
+        if mark > start:
+            got = loop.take(taken[start:mark]) or got
+        loop.obey(int(taken["data"][mark, 0]))
+        start = int(mark) + 1
+    return (loop.take(taken[start:]) if start < len(taken) else False) or got
+
+
+def _record(taken: FrameArray, outlets: Outlets, paced: bool) -> None:
+    if not outlets.recording:
+        return
+    ring, control = outlets.frames, outlets.control
+    while not paced and ring.count + len(taken) - control.recorded > ring.capacity and not control.stop:
+        time.sleep(0.001)
+    ring.push(taken)
+
+
+__all__ = ["EVENTS", "LoopOrder", "Loop", "Mode", "Outlets", "Validity", "run_loop", "settings_of"]

@@ -1,0 +1,74 @@
+"""A few numbers that the processes of a run tell each other: one block of shared memory, nobody waits on it.
+
+Orders (stop, go, align) come from the session and the publisher, the loss of samples from the loop, the count of recorded
+frames from the recorder.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hil.ring import Shared
+
+_STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _FIELDS = range(7)
+
+
+class Control:
+    """Shared numbers; survives being passed to a spawned process."""
+
+    def __init__(self, shared: Shared | None = None) -> None:
+        self._shared = Shared(8 * _FIELDS) if shared is None else shared
+        self._values = np.frombuffer(self._shared.memory, np.int64, _FIELDS)
+
+    def __reduce__(self) -> Any:
+        return Control, (self._shared,)
+
+    @property
+    def stop(self) -> bool:
+        """The loop and its feeder shall end."""
+        return bool(self._values[_STOP])
+
+    def order_stop(self) -> None:
+        """Tell the loop and its feeder to end."""
+        self._values[_STOP] = 1
+
+    @property
+    def go(self) -> bool:
+        """The loop listens: whoever feeds it may begin."""
+        return bool(self._values[_GO])
+
+    def order_go(self) -> None:
+        """Let the feeder begin."""
+        self._values[_GO] = 1
+
+    @property
+    def align_requests(self) -> int:
+        """How many times an alignment has been asked for."""
+        return int(self._values[_ALIGN_REQUESTS])
+
+    def request_align(self) -> None:
+        """Ask the loop to align."""
+        self._values[_ALIGN_REQUESTS] += 1
+
+    @property
+    def lost(self) -> int:
+        """Sensor samples lost since the start."""
+        return int(self._values[_LOST])
+
+    @property
+    def samples(self) -> int:
+        """Sensor samples received since the start."""
+        return int(self._values[_SAMPLES])
+
+    def set_loss(self, lost: int, samples: int) -> None:
+        """Tell how many sensor samples were lost and received since the start."""
+        self._values[_LOST], self._values[_SAMPLES] = lost, samples
+
+    @property
+    def recorded(self) -> int:
+        """Frames that the recorder has taken over."""
+        return int(self._values[_RECORDED])
+
+    @recorded.setter
+    def recorded(self, count: int) -> None:
+        self._values[_RECORDED] = count

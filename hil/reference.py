@@ -1,0 +1,113 @@
+"""Comparison with an attitude that came with a log: the autopilot's own estimate."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hil.geometry import Spread, attitude_difference
+from nav.increments import FloatArray
+from nav.rotation import from_rotation_vector, multiply, normalise
+from nav.state import Mode
+
+SETTLE_S = 10.0
+"""Time from the start of the log that is not compared."""
+
+
+@dataclass(slots=True)
+class Trace:
+    """Every attitude of a run, kept for the comparison at its end."""
+
+    times: list[FloatArray] = field(default_factory=list)
+    attitudes: list[FloatArray] = field(default_factory=list)
+
+    def add(self, rows: NDArray[Any]) -> None:
+        """Take solutions (`NAV_STATE`) that have an attitude."""
+        good = rows[rows["mode"] >= Mode.NAVIGATE]
+        self.times.append(good["time"].copy())
+        self.attitudes.append(good["q_nb"].copy())
+
+    def arrays(self) -> tuple[FloatArray, FloatArray]:
+        """(n,) times and (n, 4) attitudes."""
+        return np.concatenate(self.times), np.concatenate(self.attitudes)
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Another estimator's attitude.
+
+    Attributes
+    ----------
+    time : (n,) float
+        Device time, s.
+    q_nb : (n, 4) float
+        Its attitude.
+    gyro_time, gyro : (m,), (m, 3) float
+        The raw rates of the log, rad/s, for the baseline of plain integration.
+    start : float
+        Device time of the log's start, s.
+    """
+
+    time: FloatArray
+    q_nb: FloatArray
+    gyro_time: FloatArray
+    gyro: FloatArray
+    start: float
+
+    def differences(self, trace: Trace) -> dict[str, Any]:
+        """``difference`` of our attitude and ``baseline`` of plain gyro integration, from `SETTLE_S` on, degrees."""
+        times, attitudes = trace.arrays() if trace.times else (np.zeros(0), np.zeros((0, 4)))
+        return {
+            "difference": self._compare(times, attitudes),
+            "baseline": self._compare(*self._plain()),
+        }
+
+    def chosen(self, times: FloatArray) -> NDArray[np.bool_]:
+        """The reference samples that are compared with a solution at `times`."""
+        if len(times) == 0:
+            return np.zeros(len(self.time), bool)
+        return (self.time >= self.start + SETTLE_S) & (self.time >= times[0]) & (self.time <= times[-1])
+
+    def errors(self, times: FloatArray, attitudes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """(time, total, tilt, heading) of the difference at each compared reference sample, s and rad."""
+        chosen = self.chosen(times)
+        at = self.time[chosen]
+        return (at, *attitude_difference(interpolate_attitude(times, attitudes, at), self.q_nb[chosen]))
+
+    def _compare(self, times: FloatArray, attitudes: FloatArray) -> dict[str, Any] | None:
+        if not self.chosen(times).any():
+            return None
+        _, *parts = self.errors(times, attitudes)
+        result = {}
+        for name, values in zip(("total_deg", "tilt_deg", "heading_deg"), parts, strict=True):
+            spread = Spread()
+            spread.add(values)
+            result[name] = spread.as_dict(180.0 / np.pi)
+        return result
+
+    def _plain(self) -> tuple[FloatArray, FloatArray]:
+        """Attitude by plain integration of the raw rates from the reference's first attitude."""
+        first = int(np.searchsorted(self.gyro_time, self.time[0]))
+        times = self.gyro_time[first:]
+        attitudes = np.empty((len(times), 4))
+        q, delta = self.q_nb[0].copy(), np.empty(4)
+        for k in range(len(times)):
+            if k:
+                from_rotation_vector(*(self.gyro[first + k] * (times[k] - times[k - 1])), delta)
+                multiply(q, delta, q)
+                normalise(q)
+            attitudes[k] = q
+        return times, attitudes
+
+
+def interpolate_attitude(times: FloatArray, q: FloatArray, at: FloatArray) -> FloatArray:
+    """Attitudes (n, 4) at times inside `times`, linear in the quaternion and normalised (steps are short)."""
+    right = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    span = times[right] - times[right - 1]
+    weight = np.where(span > 0, (at - times[right - 1]) / np.where(span > 0, span, 1.0), 0.0)[:, None]
+    a, b = q[right - 1], q[right]
+    b = np.where(np.sum(a * b, axis=1, keepdims=True) < 0, -b, b)
+    mixed = a * (1 - weight) + b * weight
+    result: FloatArray = mixed / np.linalg.norm(mixed, axis=1, keepdims=True)
+    return result

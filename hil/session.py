@@ -1,0 +1,286 @@
+"""A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
+
+    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, this process
+
+Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
+"""
+
+import contextlib
+import multiprocessing as mp
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
+from hil.publisher import run_publisher
+from hil.recorder import run_recorder
+from hil.stats import Phase
+from hil.warmup import STEPS
+from hil.world.head import run_head
+from nav.errors import HilError
+from nav.state import NAV_STATE, Mode
+
+START_S = 180.0
+"""Longest time for the processes to get ready (the first compilation is in it)."""
+STOP_S = 10.0
+"""Longest time for a process to end on its own."""
+DRAIN_S = 1.0
+"""Time for the loop to take what is on its way when the feeder has ended."""
+
+_Answers = dict[str, Any]
+
+
+@dataclass(slots=True)
+class _Part:
+    name: str
+    process: BaseProcess
+    connection: Connection
+    answers: _Answers = field(default_factory=dict)
+
+    def read(self) -> None:
+        """Take what the process has answered."""
+        with contextlib.suppress(EOFError, OSError):
+            while self.connection.poll():
+                self.answers.update(self.connection.recv())
+
+
+class Session:
+    """One run; use as a context manager.
+
+    Parameters
+    ----------
+    order : LoopOrder
+        What the loop does.
+    feeder : callable, optional
+        Target of the process that feeds the bus, called ``feeder(*feeder_args, control, stats, connection)``; the
+        simulated head is `simulated_head`.
+    record : Path, optional
+        Recording to write.
+    publish : bool
+        Send MAVLink on the links of the scenario.
+    """
+
+    def __init__(
+        self,
+        order: LoopOrder,
+        *,
+        feeder: tuple[Callable[..., None], Sequence[Any]] | None = None,
+        record: Path | None = None,
+        publish: bool = True,
+    ) -> None:
+        self.order = order
+        self.outlets = Outlets.make(recording=record is not None, readers=1)
+        self._feeder = feeder
+        self._record = record
+        self._publish = publish
+        self._parts: dict[str, _Part] = {}
+        self._event_number = 0
+        self._row = np.zeros(1, NAV_STATE)
+        self._feeder_ended: float | None = None
+        self._began = 0.0
+        self._ended = 0.0
+        self.problems: list[str] = []
+        """What went wrong with a part of the run without ending it."""
+
+    def __enter__(self) -> "Session":
+        try:
+            self._start()
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end()
+
+    def _start(self) -> None:
+        scenario, outlets = self.order.scenario, self.outlets
+        context = mp.get_context("forkserver")
+        context.set_forkserver_preload(["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"])
+
+        def launch(name: str, target: Callable[..., None], *args: Any) -> None:
+            ours, theirs = context.Pipe()
+            process = context.Process(target=target, args=(*args, theirs), name=f"hil-{name}", daemon=True)
+            process.start()
+            theirs.close()
+            self._parts[name] = _Part(name, process, ours)
+
+        if self._record is not None:
+            header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
+            launch("recorder", run_recorder, self._record, header, outlets)
+        launch("loop", run_loop, self.order, outlets)
+        if self._feeder is not None:
+            target, args = self._feeder
+            launch("feeder", target, *args, outlets.control, outlets.stats)
+        if self._publish and scenario.mavlink.links:
+            launch("publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, outlets.stats)
+
+    def compiling(self) -> tuple[int, int]:
+        """(steps done, steps in all) of getting ready."""
+        stats = self.outlets.stats
+        total = STEPS * (2 if self._feeder is not None else 1)
+        return stats["warm_loop"] + (stats["warm_head"] if self._feeder is not None else 0), total
+
+    @property
+    def ready(self) -> bool:
+        """The loop listens; on the first call that finds it so, the feeder begins.
+
+        Raises
+        ------
+        HilError
+            A part of the run failed, or did not get ready in time.
+        """
+        self._watch()
+        if self.outlets.stats["phase"] == Phase.STARTING:
+            return False
+        if not self.outlets.control.go:
+            self._began = time.monotonic()
+            self.outlets.control.order_go()
+        return True
+
+    @property
+    def running(self) -> bool:
+        """The loop is at work.
+
+        Raises
+        ------
+        HilError
+            The loop or the feeder failed.
+        """
+        self._watch()
+        if not self.ready:
+            return True
+        feeder = self._parts.get("feeder")
+        if feeder is not None and not feeder.process.is_alive():
+            self._feeder_ended = self._feeder_ended or time.monotonic()
+            if time.monotonic() - self._feeder_ended > DRAIN_S:
+                self.stop()
+        return self.outlets.stats["phase"] in (Phase.READY, Phase.RUNNING) and not self.outlets.control.stop
+
+    def wait_ready(self, on_wait: Callable[[], None] = lambda: None) -> None:
+        """Block until the loop listens; `on_wait` is called ten times a second."""
+        deadline = time.monotonic() + START_S
+        while not self.ready:
+            if time.monotonic() > deadline:
+                raise HilError(f"the bridge was not ready after {START_S:g} s")
+            on_wait()
+            time.sleep(0.1)
+
+    def wait_mode(self, *modes: Mode, timeout_s: float = 60.0) -> Any:
+        """Block until the navigator is in one of `modes`; the state then.
+
+        Raises
+        ------
+        HilError
+            It was not in time, or the run ended before.
+        """
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            state = self.state()
+            if state is not None and state["mode"] in modes:
+                return state
+            if not self.running:
+                break
+            time.sleep(0.02)
+        names = " or ".join(mode.name.lower() for mode in modes)
+        raise HilError(f"mode {names} was not reached in {timeout_s:g} s")
+
+    def state(self) -> Any:
+        """A copy of the newest `NAV_STATE` row; None before the first."""
+        return self._row[0].copy() if self.outlets.states.latest(self._row) else None
+
+    def events(self) -> list[tuple[float, str, str]]:
+        """(device time, severity, text) of what happened since the last call."""
+        rows = np.zeros(64, EVENTS)
+        copied, first = self.outlets.events.pull(rows, self._event_number)
+        self._event_number = first + copied
+        return [
+            (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace")) for row in rows[:copied]
+        ]
+
+    def stop(self) -> None:
+        """Tell the loop to end."""
+        self.outlets.control.order_stop()
+
+    def _watch(self) -> None:
+        for part in self._parts.values():
+            part.read()
+            failed = part.answers.get("failed")
+            died = part.process.exitcode not in (None, 0) and not failed
+            if died:
+                failed = f"the {part.name} process died (exit code {part.process.exitcode})"
+            if not failed:
+                continue
+            if part.name in {"loop", "feeder"} or (part.name == "publisher" and not self.outlets.control.go):
+                raise HilError(str(failed))
+            if failed not in self.problems:
+                self.problems.append(str(failed))
+
+    def _end(self) -> None:
+        self._ended = time.monotonic()
+        control, stats = self.outlets.control, self.outlets.stats
+        control.order_stop()
+        deadline = time.monotonic() + STOP_S
+        for name in ("loop", "feeder", "recorder", "publisher"):
+            part = self._parts.get(name)
+            if part is None:
+                continue
+            while part.process.is_alive() and time.monotonic() < deadline:
+                part.read()
+                part.process.join(0.02)
+            if part.process.is_alive():
+                part.process.kill()
+                part.process.join()
+                self.problems.append(f"the {name} process did not end and was killed")
+            if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
+                stats["phase"] = Phase.FAILED  # it died: the recorder must know
+            part.read()
+
+    def summary(self) -> dict[str, Any]:
+        """What the run showed, as `hil run --json` prints it; complete after the end."""
+        stats = self.outlets.stats
+        names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
+        more = ("restarts", "interpolated", "silences")
+        wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
+        state = self.state()
+        device_s = self.device_seconds(state)
+        result: dict[str, Any] = {"scenario": self.order.scenario.name}
+        result.update({name: stats[name] for name in (*names, *more)})
+        result["rate_hz"] = stats["samples"] / device_s if device_s > 0 else 0.0
+        result["wall_s"], result["device_s"] = wall, device_s
+        result["speed"] = device_s / wall if wall else 0.0
+        result["latency_us"] = stats.latency_us()
+        result["mavlink_sent"] = {}
+        for name in ("loop", "feeder", "publisher", "recorder"):
+            part = self._parts.get(name)
+            if part is not None:
+                part.read()
+                answers = {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
+                if name == "feeder":
+                    result["head_sent"] = answers.get("sent", 0)
+                    result["head_dropped"] = answers.get("dropped", 0)
+                else:
+                    result.update(answers)
+        if self._record is not None:
+            result["recorder_lost"] = stats["recorder_lost"]
+        if self.problems:
+            result["problems"] = self.problems
+        return result
+
+    def device_seconds(self, state: Any) -> float:
+        """Device time that the samples since the head's last start cover."""
+        return 0.0 if state is None else float(state["time"]) - self.outlets.stats["started_us"] * 1e-6
+
+
+def simulated_head(order: LoopOrder) -> tuple[Callable[..., None], Sequence[Any]]:
+    """The feeder that simulates the head of the order's scenario."""
+    return run_head, (order.scenario, order.paced)

@@ -1,0 +1,119 @@
+"""The simulated sensor head: the scenario's motion through ideal instruments onto the bus, in a process of its own.
+
+The frames depend on the scenario alone: the same scenario gives the same bytes at any speed.
+"""
+
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+from drivers.can.bus import Port, open_port
+from drivers.can.dtg_head_emulator import SIMULATED, HeadEncoder
+from drivers.can.frames import FrameArray, frames
+from hil.control import Control
+from hil.pacing import Pacer
+from hil.scenario import Scenario
+from hil.stats import Stats
+from hil.warmup import warm_head
+from hil.world.motion import Motion
+from nav.errors import HilError
+from nav.rotation import dcm_from_quaternion, quaternion_from_euler
+
+CHUNK_S = 0.1
+"""Motion is computed this far ahead."""
+
+
+class SimulatedHead:
+    """Frames of the head of a scenario.
+
+    The increments of both y axes are equal: the instruments are ideal.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        head = scenario.head
+        self.period_us = round(1e6 / head.rate_hz)
+        self.step = self.period_us * 1e-6
+        self.frames_per_sample = 1 if head.layout == "fd" else 6
+        self._motion = Motion(scenario.motion, head.lever_arm_m)
+        self._c_hb = dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))).T
+        self._encoder = HeadEncoder(
+            head.layout, self.period_us, serial=head.serial, world_id=scenario.world_id(), hardware=SIMULATED
+        )
+        self._slow_every = max(1, round(1.0 / self.step))
+        self._chunk = max(1, min(self._slow_every, round(CHUNK_S / self.step)))
+
+    def chunks(self, samples: int | None) -> Iterator[tuple[int, FrameArray, FrameArray]]:
+        """(number of the first sample, slow frames before it, frames of its samples), until `samples` are out."""
+        first = 0
+        while samples is None or first < samples:
+            until_slow = self._slow_every - first % self._slow_every
+            count = min(self._chunk, until_slow, (samples or first + self._chunk) - first)
+            slow = self._encoder.slow() if first % self._slow_every == 0 else frames(0)
+            yield first, slow, self._samples(first, count)
+            first += count
+
+    def _samples(self, first: int, count: int) -> FrameArray:
+        dtheta, dvel = np.empty((count, 3)), np.empty((count, 3))
+        self._motion.increments(first, count, self.step, dtheta, dvel)
+        head_dtheta = dtheta @ self._c_hb.T
+        counter = np.arange(first, first + count)
+        return self._encoder.samples(
+            counter, (counter + 1) * self.period_us, head_dtheta[:, (0, 1, 1, 2)], dvel @ self._c_hb.T
+        )
+
+
+def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool, cancelled: Callable[[], bool]) -> int:
+    """Send the head's frames, each sample at its time when `paced`; the number of samples sent."""
+    pacer = Pacer()
+    k = head.frames_per_sample
+    sent = 0
+    for first, slow, batch in head.chunks(samples):
+        if cancelled():
+            break
+        if not paced:
+            port.send(np.concatenate([slow, batch]))
+            sent += len(batch) // k
+            continue
+        if len(slow):
+            port.send(slow)
+        for i in range(len(batch) // k):
+            if not pacer.wait((first + i + 1) * head.step, cancelled):
+                return sent
+            port.send(batch[i * k : (i + 1) * k])
+            sent += 1
+    return sent
+
+
+def run_head(scenario: Scenario, paced: bool, control: Control, stats: Stats, answer: Connection) -> None:
+    """Target of the head's process: begins on `Control.go`.
+
+    Answers ``{"sent": samples, "dropped": frames}`` or ``{"failed": message}``.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        warm_head(scenario, lambda done: stats.__setitem__("warm_head", done))
+        head = SimulatedHead(scenario)
+        while not (control.go or control.stop):
+            time.sleep(0.005)
+        answer.send(feed(head, scenario, paced=paced, cancelled=lambda: control.stop))
+    except HilError as error:
+        answer.send({"failed": str(error)})
+    finally:
+        answer.close()
+
+
+def feed(head: SimulatedHead, scenario: Scenario, *, paced: bool, cancelled: Callable[[], bool]) -> dict[str, object]:
+    """Run `head` on the scenario's bus to the scenario's end; samples sent and frames dropped."""
+    duration = scenario.duration_s
+    samples = None if duration is None else math.ceil(duration / head.step - 1e-6)
+    port = open_port(scenario.bus, listen=False, lossless=not paced)
+    try:
+        sent = stream(head, port, samples, paced=paced, cancelled=cancelled)
+    finally:
+        dropped = port.dropped
+        port.close()
+    return {"sent": sent, "dropped": dropped}
