@@ -63,12 +63,15 @@ class LoopOrder:
         Real time; False: as fast as it goes, lossless.
     reference : Reference, optional
         An attitude to compare with (another estimator's, from a log).
+    keep_trace : bool
+        Give our attitudes back with the result (``trace``: times, attitudes).
     """
 
     scenario: Scenario
     file: Path | None = None
     paced: bool = True
     reference: Reference | None = None
+    keep_trace: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +134,7 @@ class Loop:
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
         self._reference = order.reference
+        self._keep_trace = order.keep_trace
         self._clock = ClockMap()
         self._restarts = 0
         self._started: float | None = None
@@ -260,6 +264,8 @@ class Loop:
             result["error"] = error
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
+            if self._keep_trace:
+                result["trace"] = self._trace.arrays()
         return result
 
 

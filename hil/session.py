@@ -21,6 +21,7 @@ import numpy as np
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.publisher import run_publisher
 from hil.recorder import run_recorder
+from hil.ring import Wake
 from hil.stats import Phase
 from hil.warmup import STEPS
 from hil.world.head import run_head
@@ -80,6 +81,7 @@ class Session:
         self._feeder = feeder
         self._record = record
         self._publish = publish
+        self._publisher_stop = Wake()
         self._parts: dict[str, _Part] = {}
         self._event_number = 0
         self._row = np.zeros(1, NAV_STATE)
@@ -122,7 +124,7 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            launch("publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, outlets.stats)
+            launch("publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -234,6 +236,8 @@ class Session:
             part = self._parts.get(name)
             if part is None:
                 continue
+            if name == "publisher":
+                self._publisher_stop.call()
             while part.process.is_alive() and time.monotonic() < deadline:
                 part.read()
                 part.process.join(0.02)

@@ -1,0 +1,330 @@
+"""The command `hil`. Exit code 2 for a wrong request, 1 for a failed run, 0 otherwise; ``--json`` prints one object."""
+
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from nav.errors import HilError
+
+if TYPE_CHECKING:
+    from hil.bridge import LoopOrder
+    from hil.session import Session
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+
+
+class RunFailed(HilError):
+    """The request was right and the run failed."""
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else.")]
+Bus = Annotated[str | None, typer.Option(help="Bus URL: unix:NAME, socketcan:vcan0, udp_multicast:239.74.163.2, ...")]
+Duration = Annotated[float | None, typer.Option(min=0.0, help="Seconds of device time, then stop.")]
+Speed = Annotated[str, typer.Option(help="1: real time; max: simulated time, as fast as it goes.")]
+Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the simulated errors.")]
+Links = Annotated[
+    list[str] | None, typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none.")
+]
+Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
+Asserts = Annotated[list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")]
+Junit = Annotated[Path | None, typer.Option(help="Write the assertions as JUnit XML.")]
+ScenarioName = Annotated[str | None, typer.Argument(help="TOML file or built-in name; left out: the embedded default.")]
+
+
+@app.command()
+def run(
+    scenario: ScenarioName = None,
+    bus: Bus = None,
+    imu: Annotated[str | None, typer.Option(help="Driver of the board on the bus; then no head is simulated.")] = None,
+    mavlink: Links = None,
+    duration: Duration = None,
+    speed: Speed = "1",
+    seed: Seed = None,
+    record: Record = None,
+    assertion: Asserts = None,
+    junit: Junit = None,
+    as_json: Json = False,
+) -> None:
+    """Run the bridge: IMU in, navigation, MAVLink out. Without --bus and --imu it brings its own simulated head."""
+    from hil.bridge import LoopOrder
+    from hil.scenario import load
+    from hil.session import simulated_head
+
+    chosen = load(scenario).with_changes(**_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink))
+    order = LoopOrder(chosen, paced=_paced(speed))
+    outside = bus is not None or imu is not None
+    if outside and not order.paced:
+        raise HilError("--speed max needs the simulated head of this process: leave --bus and --imu out")
+    _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
+
+
+@app.command()
+def imu(
+    scenario: ScenarioName = None,
+    bus: Bus = None,
+    duration: Duration = None,
+    speed: Speed = "1",
+    seed: Seed = None,
+    as_json: Json = False,
+) -> None:
+    """Run the simulated sensor head alone, for a bridge in another process or on another machine."""
+    from hil.scenario import load
+    from hil.world.head import SimulatedHead, feed
+
+    chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
+    stop = _StopSignal()
+    head = SimulatedHead(chosen)
+    _say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
+    result = feed(head, chosen, paced=_paced(speed), cancelled=lambda: stop.wanted)
+    _report({"scenario": chosen.name, **result}, as_json=as_json)
+
+
+@app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(help="Our recording, PX4 .ulg, candump .log, .blf, .asc.")],
+    scenario: Annotated[str | None, typer.Option(help="Scenario instead of the one in the recording.")] = None,
+    bus: Bus = None,
+    mavlink: Links = None,
+    speed: Speed = "1",
+    record: Record = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
+    assertion: Asserts = None,
+    junit: Junit = None,
+    as_json: Json = False,
+) -> None:
+    """Send a recording through the same bridge."""
+    from dataclasses import replace
+
+    from hil.player import plan_replay, run_player
+
+    order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
+    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink)))
+    if plot is not None:
+        if order.reference is None:
+            raise HilError(f"--plot: {log} carries no attitude to compare with")
+        from hil.plot import check_plot
+
+        check_plot(plot)
+        order = replace(order, keep_trace=True)
+    feeder = (run_player, (log, order.scenario, order.paced)) if over_bus else None
+    summary = _run(order, feeder, record, assertion, junit, as_json=as_json, quiet_exit=plot is not None)
+    if plot is not None and order.reference is not None:
+        from hil.plot import plot_difference
+
+        plot_difference(plot, order.reference, summary.pop("trace"), log.name)
+        _say(f"plot written to {plot}")
+
+
+@app.command()
+def navigate(
+    imu_file: Annotated[Path, typer.Argument(metavar="IMU.csv", help="Increments: .csv, .npz or .parquet.")],
+    init: Annotated[Path, typer.Option(help="TOML with the start.")],
+    out: Annotated[Path, typer.Option(help="Where the navigation goes: .csv, .npz or .parquet.")],
+    attitude: Annotated[str, typer.Option(help="Attitude method.")] = "two-sample",
+    mechanization: Annotated[str, typer.Option(help="Mechanization.")] = "geographic",
+    gravity: Annotated[str, typer.Option(help="Gravity model.")] = "normal",
+    every: Annotated[float | None, typer.Option(min=0.0, help="Seconds between rows of the output.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Navigate logged increments offline."""
+    from hil.offline import IMU_HEADER, NAV_HEADER, read_start, read_table, thin, write_table
+    from hil.offline import navigate as navigate_rows
+    from nav.mechanization import check_choice
+
+    check_choice(attitude, mechanization)
+    if gravity != "normal":
+        raise HilError(f"unknown gravity {gravity!r}; there is: normal")
+    table, start = read_table(imu_file, IMU_HEADER), read_start(init)
+    began = time.perf_counter()
+    rows = navigate_rows(table, start, attitude, mechanization)
+    seconds = time.perf_counter() - began
+    if every:
+        rows = thin(rows, every)
+    write_table(out, NAV_HEADER, rows)
+    final = dict(zip(NAV_HEADER, rows[-1].tolist(), strict=True))
+    _report({"samples": len(table), "rows": len(rows), "seconds": seconds, "final": final}, as_json=as_json)
+
+
+@app.command()
+def decode(
+    driver: Annotated[str, typer.Argument(help="Name of the driver, as dtg-head.")],
+    file: Annotated[Path, typer.Argument(help="Recording of frames.")],
+) -> None:
+    """Decode recorded frames to JSON samples, one a line; the counters go to standard error."""
+    from hil.decoder import decode_file
+
+    lines, counters, problem = decode_file(driver, file)
+    try:
+        for line in lines:
+            sys.stdout.write(line)
+    except BrokenPipeError:
+        return
+    _say(json.dumps(counters()))
+    if problem():
+        raise RunFailed(problem())
+
+
+@app.command()
+def record(
+    file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
+    bus: Annotated[str, typer.Option(help="Bus URL.")],
+    duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds, then stop.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Record what is on the bus."""
+    from hil.decoder import record_bus
+
+    stop = _StopSignal()
+    _report(record_bus(bus, file, duration, lambda: stop.wanted), as_json=as_json)
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Say what this machine can do, and the command that mends each lack."""
+    from hil.doctor import examine
+
+    findings = examine()
+    if as_json:
+        print(json.dumps({"findings": [finding.as_dict() for finding in findings]}))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(show_header=False)
+    colours = {"ok": "green", "lack": "yellow", "info": "cyan"}
+    for finding in findings:
+        table.add_row(
+            f"[{colours[finding.verdict]}]{finding.verdict}[/]", finding.what, finding.found, finding.mend, end_section=False
+        )
+    Console(highlight=False).print(table)
+
+
+@app.command()
+def bench(as_json: Json = False) -> None:
+    """Measure the speed of each part on this machine."""
+    from hil.bench import measure
+
+    rows = measure(_say)
+    if as_json:
+        print(json.dumps({"rows": rows}))
+        return
+    for row in rows:
+        ratio = "" if row["peer_ns"] is None else f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        print(f"{row['id']:24} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    from importlib.metadata import version as installed
+
+    print(f"dtg-hil {installed('dtg-hil')}")
+
+
+def _run(
+    order: "LoopOrder",
+    feeder: Any,
+    record_to: Path | None,
+    assertions: list[str] | None,
+    junit: Path | None,
+    *,
+    as_json: bool,
+    quiet_exit: bool = False,
+) -> dict[str, Any]:
+    """Run a session to its end, show it, check the assertions; the summary."""
+    from hil.assertions import parse, write_junit
+    from hil.console import RunView, print_summary
+    from hil.session import Session
+
+    checks = [parse(text) for text in assertions or []]
+    if junit is not None and not checks:
+        raise HilError("--junit needs at least one --assert")
+    stop = _StopSignal()
+    session = Session(order, feeder=feeder, record=record_to)
+    with session, RunView(session) as view:
+        while not (session.ready or stop.wanted):
+            view.show_compiling()
+            time.sleep(0.1)
+        try:
+            _follow(session, stop, view)
+        except HilError as error:
+            raise RunFailed(str(error)) from error
+    view.show_events()
+    summary = session.summary()
+    shown = {key: value for key, value in summary.items() if key != "trace"}
+    if as_json:
+        print(json.dumps(shown))
+    else:
+        print_summary(shown)
+    outcome = [(check, check.failure(shown)) for check in checks]
+    if junit is not None:
+        write_junit(junit, order.scenario.name, outcome, shown["wall_s"])
+    failures = [failure for _, failure in outcome if failure]
+    if failures:
+        raise RunFailed("\n".join(f"assertion failed: {failure}" for failure in failures))
+    return summary
+
+
+def _follow(session: "Session", stop: "_StopSignal", view: Any) -> None:
+    while session.running:
+        if stop.wanted:
+            session.stop()
+        view.refresh(time.monotonic())
+        time.sleep(0.1)
+
+
+class _StopSignal:
+    """Ctrl-C or SIGTERM asks for a clean stop; a second one ends at once."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._take)
+
+    def _take(self, _number: int, _frame: FrameType | None) -> None:
+        if self.wanted:
+            raise SystemExit(130)
+        self.wanted = True
+
+
+def _paced(speed: str) -> bool:
+    if speed not in {"1", "max"}:
+        raise HilError(f"--speed {speed}: expected 1 or max")
+    return speed == "1"
+
+
+def _changes(mavlink: list[str] | None = None, **options: Any) -> dict[str, Any]:
+    changes = {key: value for key, value in options.items() if value is not None}
+    if mavlink:
+        changes["mavlink"] = {"links": () if mavlink == ["none"] else tuple(mavlink)}
+    return changes
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _report(result: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(result))
+        return
+    for key, value in result.items():
+        print(f"{key}: {value}")
+
+
+def main() -> None:
+    """Entry point."""
+    try:
+        app()
+    except HilError as error:
+        for line in str(error).splitlines():
+            _say(f"hil: {line}")
+        raise SystemExit(1 if isinstance(error, RunFailed) else 2) from None
+
+

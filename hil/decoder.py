@@ -1,0 +1,89 @@
+"""Frames without navigation: decoding a file to JSON lines, recording a bus."""
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+
+from drivers import make_driver
+from drivers.can.bus import open_port
+from drivers.can.convert import to_message
+from drivers.can.frames import frames
+from drivers.logs.recording import EVENT, RecordingWriter
+from hil.source import FileSource
+from nav.errors import HilError
+
+_FIELDS = ("time", "step", "sequence", "validity", "dtheta", "dvel", "rotor")
+
+
+def decode_file(driver_name: str, path: Path) -> tuple[Iterator[str], Callable[[], dict[str, int]], Callable[[], str]]:
+    """JSON lines of the samples in `path`, and, once they are drawn, the driver's counters and what was wrong."""
+    driver = make_driver(driver_name)
+    source = FileSource(path, paced=False)
+
+    def lines() -> Iterator[str]:
+        batch = frames(256)
+        while n := source.receive(batch, 0.0):
+            good = batch[:n][batch["reserved"][:n, 0] != EVENT]
+            samples = driver.decode(good)
+            for k in range(len(samples)):
+                yield json.dumps({name: _plain(getattr(samples, name)[k]) for name in _FIELDS if hasattr(samples, name)}) + "\n"
+
+    return lines(), driver.counters.as_dict, source.problem
+
+
+def _plain(value: Any) -> Any:
+    """A JSON value; NaN (not on this wire) is null."""
+    listed = value.tolist()
+    if isinstance(listed, list):
+        return [None if item != item else item for item in listed]
+    return listed
+
+
+def record_bus(url: str, path: Path, duration_s: float | None, cancelled: Callable[[], bool]) -> dict[str, Any]:
+    """Record frames of the bus until cancelled; what was recorded."""
+    port = open_port(url)
+    batch = frames(1024)
+    count, began = 0, time.monotonic()
+    try:
+        with _writer(path, url) as write:
+            while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
+                n = port.receive(batch, 0.05)
+                write(batch[:n])
+                count += n
+    finally:
+        port.close()
+    return {"file": str(path), "frames": count, "seconds": time.monotonic() - began}
+
+
+class _writer:
+    """Our recording by the ending .dhil, python-can's writers by any other."""
+
+    def __init__(self, path: Path, url: str) -> None:
+        self._own: RecordingWriter | None = None
+        if path.suffix == ".dhil":
+            from hil.scenario import load
+
+            scenario = load(None).with_changes(bus=url).model_dump(mode="json")
+            self._own = RecordingWriter(path, {"scenario": scenario, "created_ns": time.time_ns()})
+            return
+        try:
+            self._foreign: Any = can.Logger(path)
+        except (ValueError, OSError) as error:
+            raise HilError(f"record {path}: {error}; endings: .dhil, .log (candump), .blf, .asc") from error
+
+    def __enter__(self) -> Callable[[Any], None]:
+        return self._own.write if self._own is not None else self._write_foreign
+
+    def _write_foreign(self, batch: Any) -> None:
+        for row in batch:
+            self._foreign.on_message_received(to_message(row, "can0"))
+
+    def __exit__(self, *_: object) -> None:
+        if self._own is not None:
+            self._own.close()
+        else:
+            self._foreign.stop()

@@ -1,0 +1,143 @@
+"""`hil doctor`: what this machine can do, and the command that mends each lack."""
+
+import importlib.util
+import os
+import platform
+import resource
+import shutil
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from drivers import driver_names
+
+ARPHRD_CAN = "280"
+WANTED_RMEM = 4 << 20
+Verdict = Literal["ok", "lack", "info"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    verdict: Verdict
+    found: str
+    mend: str = ""
+
+    def as_dict(self) -> dict[str, str]:
+        """For ``--json``."""
+        return asdict(self)
+
+
+def examine() -> list[Finding]:
+    """All findings."""
+    return [*_python(), *_can(), *_real_time(), *_network(), *_serial(), *_extras()]
+
+
+def _python() -> Iterator[Finding]:
+    version = platform.python_version()
+    good = sys.version_info >= (3, 11)
+    yield Finding("python", "ok" if good else "lack", version, "" if good else "install Python 3.11 or newer")
+    yield Finding("drivers", "info", ", ".join(driver_names()))
+
+
+def can_interfaces() -> list[str]:
+    """Names of the CAN interfaces of this machine."""
+    found = []
+    for entry in sorted(Path("/sys/class/net").glob("*")):
+        try:
+            if (entry / "type").read_text().strip() == ARPHRD_CAN:
+                found.append(entry.name)
+        except OSError:
+            continue
+    return found
+
+
+def _can() -> Iterator[Finding]:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+        kernel = True
+    except (OSError, AttributeError):
+        kernel = False
+    yield Finding(
+        "SocketCAN",
+        "ok" if kernel else "lack",
+        "the kernel has it" if kernel else "this kernel has no AF_CAN",
+        "" if kernel else "sudo modprobe can_raw; without it use unix: or udp_multicast:, or user-mode Linux (make vcan)",
+    )
+    interfaces = can_interfaces()
+    yield Finding(
+        "CAN interfaces",
+        "ok" if interfaces else "lack",
+        ", ".join(interfaces) or "none",
+        "" if interfaces else "sudo sh -c 'modprobe vcan; ip link add vcan0 type vcan && ip link set vcan0 mtu 72 up'",
+    )
+    for name in interfaces:
+        flags = int((Path("/sys/class/net") / name / "flags").read_text(), 16)
+        mtu = (Path("/sys/class/net") / name / "mtu").read_text().strip()
+        state = f"{'up' if flags & 1 else 'down'}, mtu {mtu}"
+        good = bool(flags & 1) and mtu == "72"
+        mend = f"sudo ip link set {name} down; sudo ip link set {name} mtu 72 up"
+        yield Finding(name, "ok" if good else "lack", state, "" if good else mend)
+    if not kernel:
+        uml = shutil.which("linux.uml")
+        mend = "" if uml else "sudo apt-get install user-mode-linux (make vcan does it)"
+        yield Finding("user-mode Linux (SocketCAN for tests)", "ok" if uml else "lack", uml or "not installed", mend)
+
+
+def _real_time() -> Iterator[Finding]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    good = os.geteuid() == 0 or hard > 0
+    yield Finding(
+        "real-time priority",
+        "ok" if good else "lack",
+        f"rtprio limit {soft}..{hard}{', root' if os.geteuid() == 0 else ''}",
+        "" if good else "add '@realtime - rtprio 90' to /etc/security/limits.d and join that group",
+    )
+    memlock = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
+    text = "unlimited" if memlock == resource.RLIM_INFINITY else f"{memlock >> 20} MiB"
+    yield Finding("locked memory", "info", text)
+    clock = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
+    source = clock.read_text().strip() if clock.is_file() else "unknown"
+    slow = source in {"hpet", "acpi_pm", "jiffies"}
+    mend = "choose tsc (kernel parameter clocksource=tsc): every look at the clock costs microseconds" if slow else ""
+    yield Finding("clock source", "lack" if slow else "ok", source, mend)
+    yield Finding("processors", "info", f"{len(os.sched_getaffinity(0))} usable of {os.cpu_count()}")
+
+
+def _network() -> Iterator[Finding]:
+    limit = Path("/proc/sys/net/core/rmem_max")
+    if limit.is_file():
+        size = int(limit.read_text())
+        good = size >= WANTED_RMEM or os.geteuid() == 0
+        mend = "" if good else f"sudo sysctl -w net.core.rmem_max={WANTED_RMEM}"
+        yield Finding("socket receive buffer", "ok" if good else "lack", f"rmem_max {size >> 10} KiB", mend)
+    for port in (14550,):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+                found = "free (no ground station listens yet)"
+            except OSError:
+                found = "in use: a ground station listens, or another bridge"
+        yield Finding(f"UDP port {port}", "info", found)
+
+
+def _serial() -> Iterator[Finding]:
+    from serial.tools import list_ports
+
+    ports = sorted(list_ports.comports(), key=lambda port: port.device)
+    yield Finding("serial ports", "info", ", ".join(f"{port.device} ({port.description})" for port in ports) or "none")
+    for port in ports:
+        if not os.access(port.device, os.R_OK | os.W_OK):
+            yield Finding(port.device, "lack", "no permission", "sudo usermod -aG dialout $USER, then log in again")
+
+
+def _extras() -> Iterator[Finding]:
+    for module, what, extra in (("pyulog", "PX4 logs", "logs"), ("matplotlib", "plots", "plot")):
+        there = importlib.util.find_spec(module) is not None
+        mend = "" if there else f"pip install 'dtg-hil[{extra}]'"
+        yield Finding(what, "ok" if there else "lack", module if there else f"{module} is not installed", mend)

@@ -1,0 +1,142 @@
+"""Playing a recording onto a bus: foreign IMU logs become frames of a head, frame recordings go out as they are."""
+
+import math
+import signal
+import time
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from drivers.can.bus import open_port
+from drivers.can.dtg_head_emulator import REPLAY, HeadEncoder
+from drivers.can.frames import FrameArray, frames
+from drivers.logs.recording import RecordingReader
+from drivers.logs.ulog import ImuLog, read_ulog
+from hil.bridge import LoopOrder
+from hil.control import Control
+from hil.pacing import Pacer
+from hil.reference import Reference, interpolate_attitude
+from hil.scenario import Scenario, load
+from hil.source import FileSource, is_own
+from hil.stats import Stats
+from nav.errors import HilError
+from nav.rotation import euler_from_quaternion
+
+ALIGN_S = 1.5
+"""Averaging time at the start of a log of a board that cannot gyrocompass."""
+SLOW_S = 1.0
+CHUNK = 256
+
+
+def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced: bool) -> tuple[LoopOrder, bool]:
+    """What to do with a recording: the loop's order, and whether a player has to feed the bus.
+
+    Frame recordings are read by the loop itself unless a bus is named; IMU logs always go over a bus. A recording of our
+    own brings its scenario along; `scenario_file` takes its place.
+
+    Raises
+    ------
+    HilError
+        The file cannot be read or is of no kind that is known.
+    """
+    if path.suffix.lower() == ".ulg":
+        log = read_ulog(path)
+        scenario = load(scenario_file) if scenario_file else _board_scenario(path, log)
+        reference = Reference(
+            time=log.attitude_us * 1e-6,
+            q_nb=log.attitude,
+            gyro_time=log.time_us * 1e-6,
+            gyro=log.rate,
+            start=float(log.time_us[0]) * 1e-6,
+        )
+        scenario = scenario.with_changes(bus=bus or f"unix:replay-{time.monotonic_ns():x}")
+        return LoopOrder(scenario, paced=paced, reference=reference), True
+    if is_own(path):
+        reader = RecordingReader.open(path)
+        reader.close()
+        scenario = load(scenario_file) if scenario_file else Scenario.model_validate(reader.header["scenario"])
+    elif path.suffix.lower() in {".log", ".blf", ".asc", ".trc", ".csv"}:
+        scenario = load(scenario_file)
+    else:
+        raise HilError(f"replay {path}: unknown kind; there is: our own recordings, .ulg, candump .log, .blf, .asc")
+    scenario = scenario.with_changes(duration_s=None)
+    if bus is not None:
+        return LoopOrder(scenario.with_changes(bus=bus), paced=paced), True
+    return LoopOrder(scenario, file=path, paced=paced), False
+
+
+def _board_scenario(path: Path, log: ImuLog) -> Scenario:
+    """For a board that cannot gyrocompass: level at the start, heading from the log's own estimate, bias kept at rest."""
+    times = log.attitude_us * 1e-6
+    at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
+    heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])
+    return Scenario.model_validate(
+        {
+            "name": path.stem,
+            "head": {"rate_hz": 1e6 / log.period_us},
+            "navigation": {
+                "alignment": "level",
+                "align_s": ALIGN_S,
+                "start": {"heading_deg": math.degrees(heading)},
+                "track_bias_at_rest": True,
+            },
+        }
+    )
+
+
+def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _: Stats, answer: Connection) -> None:
+    """Target of the player's process; begins on `Control.go`, answers ``{"sent", "dropped"}`` or ``{"failed"}``."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        port = open_port(scenario.bus, listen=False, lossless=not paced)
+        while not (control.go or control.stop):
+            time.sleep(0.005)
+        sent = 0
+        pacer = Pacer()
+        try:
+            for due_s, batch in _timed(path, one_by_one=paced):
+                if control.stop or (paced and not pacer.wait(due_s, lambda: control.stop)):
+                    break
+                port.send(batch)
+                sent += len(batch)
+        finally:
+            port.close()
+        answer.send({"sent": sent, "dropped": port.dropped})
+    except HilError as error:
+        answer.send({"failed": str(error)})
+    finally:
+        answer.close()
+
+
+def _timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]]:
+    """(seconds from the start, frames) of a recording."""
+    if path.suffix.lower() == ".ulg":
+        yield from _head_frames(read_ulog(path), 1 if one_by_one else CHUNK)
+        return
+    source = FileSource(path, paced=False)
+    batch = frames(CHUNK)
+    start: int | None = None
+    while n := source.receive(batch, 0.0):
+        good = batch[:n][batch["reserved"][:n, 0] == 0]
+        pieces = np.split(good, range(1, len(good))) if one_by_one else [good]
+        for piece in pieces:
+            if len(piece):
+                start = int(piece["time_ns"][0]) if start is None else start
+                yield (int(piece["time_ns"][0]) - start) * 1e-9, piece.copy()
+
+
+def _head_frames(log: ImuLog, chunk: int) -> Iterator[tuple[float, FrameArray]]:
+    """The samples of an IMU log as frames of a head."""
+    encoder = HeadEncoder("fd", log.period_us, hardware=REPLAY)
+    step_s = (log.step_us * 1e-6)[:, None]
+    dtheta, dvel = (log.rate * step_s)[:, (0, 1, 1, 2)], log.force * step_s
+    next_slow = 0
+    for first in range(0, len(log.time_us), chunk):
+        part = slice(first, first + chunk)
+        due = float(log.time_us[min(first + chunk, len(log.time_us)) - 1] - log.time_us[0]) * 1e-6
+        if log.time_us[first] >= next_slow:
+            next_slow = int(log.time_us[first]) + round(SLOW_S * 1e6)
+            yield due, encoder.slow()
+        yield due, encoder.samples(log.counter[part], log.time_us[part], dtheta[part], dvel[part])

@@ -1,0 +1,200 @@
+"""The publisher: a process that sends the newest solution as MAVLink, and hears what ground stations want.
+
+It sleeps until something is due. Then, unless the sensor is slow, it waits for the next solution and sends that one: what
+goes out has just been computed. The loop that computes never waits for it.
+"""
+
+import math
+import selectors
+import signal
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from drivers.mavlink.endpoint import Endpoint, Identity, Station
+from drivers.mavlink.link import open_link
+from hil.control import Control
+from hil.geoid import undulation
+from hil.ring import Ring, Wake
+from hil.scenario import MavlinkConfig
+from nav.errors import HilError
+from nav.state import NAV_STATE
+
+_SILENCE_S = 1.0
+"""Without a solution for this long the status says so, whatever the last solution said."""
+_READ_S = 0.1
+"""A solution is read at least this often, for the status."""
+_AGES = 1 << 16
+"""How many ages of solutions are kept for the statistics."""
+
+
+def run_publisher(
+    config: MavlinkConfig, ring: Ring, reader: int, control: Control, stop: Wake, report: Connection
+) -> None:
+    """Publish until `stop` is called or the other end of `report` is closed; target of a spawned process.
+
+    Parameters
+    ----------
+    config : MavlinkConfig
+        Links, identity and rates.
+    ring : Ring
+        Of `NAV_STATE`.
+    reader : int
+        Which of the ring's wake-ups is ours.
+    control : Control
+        Takes alignment requests to the loop; brings the loss of samples.
+    stop : Wake
+        Ends the publisher.
+    report : Connection
+        Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
+        same for each URL) and ``latency_us`` (arrival of the sample to the end of sending, `None` without one); or
+        ``error``, a text, when a link could not be opened.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
+    with ExitStack() as stack:
+        try:
+            identity = Identity(config.system_id, config.component_id, config.vehicle)
+            station = Station(identity, config.rates_hz, undulation, lambda command: _obey(command, control))
+            endpoints = []
+            for url in config.links:
+                link = open_link(url)
+                stack.callback(link.close)
+                endpoints.append(Endpoint(station, link))
+        except HilError as error:
+            _tell(report, {"error": str(error)})
+            return
+        _warm_up(station)
+        publisher = _Publisher(ring, ring.wakes[reader], control, station, endpoints)
+        stack.callback(publisher.close)
+        publisher.run(stop, report)
+        _tell(report, publisher.counters())
+
+
+class _Publisher:
+    """The state of one run."""
+
+    def __init__(
+        self, ring: Ring, wake: Wake, control: Control, station: Station, endpoints: Sequence[Endpoint]
+    ) -> None:
+        self._ring, self._wake, self._control = ring, wake, control
+        self._station, self._endpoints = station, endpoints
+        self._row = np.zeros(1, NAV_STATE)
+        self._seen = 0
+        self._read_s = -math.inf
+        self._silent = False
+        self._ages_ns = np.zeros(_AGES, np.int64)
+        self._aged = 0
+        self._selector = selectors.DefaultSelector()
+        self._watching = False
+        for endpoint in endpoints:
+            self._selector.register(endpoint.link, selectors.EVENT_READ)
+
+    def close(self) -> None:
+        self._selector.close()
+
+    def run(self, stop: Wake, report: Connection) -> None:
+        self._selector.register(stop, selectors.EVENT_READ)
+        self._selector.register(report, selectors.EVENT_READ)  # readable: the parent is gone
+        ends = (stop, report)
+        next_s = time.monotonic()
+        while True:
+            ready = [key.fileobj for key, _ in self._selector.select(max(0.0, next_s - time.monotonic()))]
+            if any(one in ends for one in ready):
+                return
+            next_s = self._step(self._wake in ready)
+
+    def _step(self, called: bool) -> float:
+        """Do what is due now; returns when to come again."""
+        if called:
+            self._wake.clear()
+        now_s = time.monotonic()
+        if called or now_s - self._read_s > _READ_S:
+            self._read(now_s)
+        next_s = self._poll(now_s)
+        if self._hungry() and self._ring.count - self._seen == 1:  # a slow sensor: do not wait for its next solution
+            self._read(now_s)
+            next_s = self._poll(now_s)
+        self._watch(self._hungry())
+        return next_s
+
+    def _hungry(self) -> bool:
+        return any(endpoint.waits for endpoint in self._endpoints)
+
+    def _poll(self, now_s: float) -> float:
+        before = sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints)
+        next_s = min((endpoint.poll(now_s) for endpoint in self._endpoints), default=now_s + _SILENCE_S)
+        if sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints) != before:
+            self._ages_ns[self._aged % _AGES] = time.time_ns() - self._row["arrival_ns"][0]
+            self._aged += 1
+        return next_s
+
+    def _read(self, now_s: float) -> None:
+        count = self._ring.count
+        if count != self._seen and self._ring.latest(self._row):
+            self._seen = count
+            self._read_s, self._silent = now_s, False
+            self._station.update(self._row[0], now_s)
+        elif self._seen and not self._silent and now_s - self._read_s > _SILENCE_S:
+            self._silent = True
+            self._station.silence()
+        self._station.set_loss(self._control.lost, self._control.samples)
+
+    def _watch(self, wanted: bool) -> None:
+        """Wait for the loop's call only while a new solution is wanted: it calls a thousand times a second."""
+        if wanted == self._watching:
+            return
+        self._watching = wanted
+        if not wanted:
+            self._selector.unregister(self._wake)
+            return
+        if self._ring.count != self._seen:
+            self._wake.clear()  # those have aged already: the next one is wanted
+        self._selector.register(self._wake, selectors.EVENT_READ)
+
+    def counters(self) -> dict[str, Any]:
+        """What was sent and received, for the report."""
+        links = {
+            endpoint.link.url: {
+                "sent": dict(endpoint.sent),
+                "received": dict(endpoint.received),
+                "bad_data": endpoint.bad_data,
+                "dropped": endpoint.dropped,
+            }
+            for endpoint in self._endpoints
+        }
+        total: dict[str, Any] = {
+            key: dict(sum((getattr(endpoint, key) for endpoint in self._endpoints), Counter[str]()))
+            for key in ("sent", "received")
+        }
+        for key in ("bad_data", "dropped"):
+            total[key] = sum(getattr(endpoint, key) for endpoint in self._endpoints)
+        return total | {"links": links, "latency_us": self._latency()}
+
+    def _latency(self) -> dict[str, float] | None:
+        ages_us = self._ages_ns[: min(self._aged, _AGES)] / 1e3
+        if not len(ages_us):
+            return None
+        p50, p99, p999 = np.percentile(ages_us, (50.0, 99.0, 99.9))
+        return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(ages_us.max())}
+
+
+def _obey(command: str, control: Control) -> None:
+    if command == "align":
+        control.request_align()
+
+
+def _warm_up(station: Station) -> None:
+    """Compile or load every kernel before the first message is due."""
+    _ = station.solution.euler, station.geoid(0.0, 0.0)
+
+
+def _tell(report: Connection, what: dict[str, Any]) -> None:
+    try:
+        report.send(what)
+    except OSError:
+        pass  # nobody is left to hear it
