@@ -145,7 +145,7 @@ class MessageCodec:
         """Values of one payload by name, for tools: ints where the value is the raw integer, absent signals left out."""
         if len(payload) < self.length:
             raise HilError(f"{self.name}: {len(payload)} bytes where {self.length} are expected")
-        data = np.frombuffer(payload, np.uint8)[None, :]
+        data = np.frombuffer(bytearray(payload), np.uint8)[None, :]
         physical = self.decode(data, np.empty((1, len(self.signals))))[0].tolist()
         raw = self.decode_raw(data, np.empty((1, len(self.signals)), np.int64))[0].tolist()
         values: dict[str, float] = {}

@@ -3,7 +3,8 @@
 Profile 5: CRC-16 (polynomial 0x1021, start 0xFFFF) over the payload from byte 2 on, then the data id, low byte first; the
 CRC stands in bytes 0..1, low byte first, an 8-bit counter in byte 2. Profile 11 (data id mode BOTH): CRC-8 (polynomial
 0x1D, start 0) over the data id, low byte first, then the payload from byte 1 on; the CRC stands in byte 0, a 4-bit
-counter in the low half of byte 1; AUTOSAR itself lets that counter run to 14 only. Source: AUTOSAR FO, E2E Protocol Specification (PRS_E2EProtocol).
+counter in the low half of byte 1; AUTOSAR itself lets that counter run to 14 only. Source: AUTOSAR FO, E2E Protocol
+Specification (PRS_E2EProtocol).
 
 Which profile, data id and counter range a message has is declared in its DBC: attributes `E2EProfile` ("P05", "P11"),
 `E2EDataId` and `E2ECounterModulus`. Payloads are rows of uint8, at least as wide as the message.
