@@ -53,7 +53,7 @@ def run_publisher(
     report : Connection
         Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
         same for each URL) and ``latency_us`` (arrival of the sample to the end of sending, `None` without one); or
-        ``error``, a text, when a link could not be opened.
+        ``failed``, a text, when a link could not be opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
@@ -66,7 +66,7 @@ def run_publisher(
                 stack.callback(link.close)
                 endpoints.append(Endpoint(station, link))
         except HilError as error:
-            _tell(report, {"error": str(error)})
+            _tell(report, {"failed": str(error)})
             return
         _warm_up(station)
         publisher = _Publisher(ring, ring.wakes[reader], control, station, endpoints)

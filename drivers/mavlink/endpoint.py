@@ -27,7 +27,6 @@ _ANNOUNCE_S = 0.5
 """Shortest time between two announcements of mode or health: a flapping flag may not fill the link."""
 _AGAIN_S = 0.5
 """When to look again at a link without a peer."""
-_READS = 4
 _MARKERS = (mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2)
 
 _MODE_TEXT = {
@@ -196,12 +195,9 @@ class Endpoint:
     def poll(self, now_s: float) -> float:
         """Read what has arrived, answer it, send what is due; returns when to come again at the latest."""
         self.station.now_s = now_s
-        for _ in range(_READS):
-            data = self.link.receive()
-            if not data:
-                break
-            for message in self._parsed(data):
-                self._take(message)
+        data = self.link.receive()  # one piece: what is due may not wait behind a flood
+        for message in self._parsed(data) if data else ():
+            self._take(message)
         if not self.link.ready():
             self.waits = False
             return now_s + _AGAIN_S

@@ -286,7 +286,8 @@ def _resolve(url: str, host: str, port: int, udp: bool) -> tuple[int, tuple[str,
         found = socket.getaddrinfo(host.strip("[]"), port, type=kind)
     except (socket.gaierror, UnicodeError) as error:
         raise HilError(f"MAVLink link {url!r}: unknown host {host!r}; expected one of {FORMS}") from error
-    family, _, _, _, address = found[0]
+    # IPv4 first: that is where ground stations listen when a name such as localhost means both
+    family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return family, (str(address[0]), int(address[1]))
 
 

@@ -54,20 +54,20 @@ class Solution:
     @classmethod
     def of(cls, row: Any, geoid: Undulation) -> "Solution":
         """The solution in `row`, one record of `NAV_STATE`."""
-        time, _, arrival_ns, _, mode, health, lat, lon, height, vel_n, q_nb, w_ib_b, f_b, _, _ = row.item()
+        values = dict(zip(row.dtype.names, row.item(), strict=True))
         return cls(
-            time,
-            arrival_ns,
-            Mode(mode),
-            Health(health),
-            lat,
-            lon,
-            height,
-            tuple(vel_n.tolist()),
-            tuple(q_nb.tolist()),
-            tuple(w_ib_b.tolist()),
-            tuple(f_b.tolist()),
-            geoid,
+            time=values["time"],
+            arrival_ns=values["arrival_ns"],
+            mode=Mode(values["mode"]),
+            health=Health(values["health"]),
+            lat=values["lat"],
+            lon=values["lon"],
+            height=values["height"],
+            vel_n=tuple(values["vel_n"].tolist()),
+            q_nb=tuple(values["q_nb"].tolist()),
+            w_ib_b=tuple(values["w_ib_b"].tolist()),
+            f_b=tuple(values["f_b"].tolist()),
+            geoid=geoid,
         )
 
     @cached_property
