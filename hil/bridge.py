@@ -8,6 +8,7 @@ its own account (silence, an ordered alignment) goes into the recording as an ev
 """
 
 import gc
+import hashlib
 import math
 import signal
 import time
@@ -33,12 +34,12 @@ from hil.warmup import warm_loop
 from hil.world.truth import TruthKeeper
 from nav.errors import HilError
 from nav.gaps import GapPolicy
-from nav.increments import HeadIncrements, ImuIncrements, Validity
+from nav.increments import HeadIncrements, ImuIncrements
 from nav.instruments.head import HeadCombiner
 from nav.lever_arm import shift
 from nav.navigator import Navigator, Settings
 from nav.rotation import dcm_from_quaternion, quaternion_from_euler
-from nav.state import NAV_STATE, Mode
+from nav.state import HOST_FIELDS, NAV_STATE
 
 BATCH = 1024
 """Most frames taken at once."""
@@ -140,6 +141,7 @@ class Loop:
         self._started: float | None = None
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
+        self._digest = hashlib.blake2b(digest_size=16)
 
     def take(self, batch: FrameArray) -> bool:
         """Decode and navigate a batch of frames; True when it held a sample."""
@@ -176,9 +178,8 @@ class Loop:
         if self._live:
             stats.add_latencies(time.time_ns() - arrivals)
             stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
-        made_up = np.count_nonzero(rows["sequence"]) - len(imu) if len(rows) != len(imu) else 0
-        if made_up:
-            stats["interpolated"] += made_up
+        if len(rows) != len(imu):
+            stats["interpolated"] += len(rows) - len(imu)
         return True
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
@@ -237,13 +238,15 @@ class Loop:
         outlets = self._outlets
         rows["solution_ns"] = time.time_ns()
         outlets.states.push(rows)
+        self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
             note = np.zeros(1, EVENTS)
             note["time"], note["severity"], note["text"] = event.time, event.severity.encode(), event.text.encode()[:240]
             outlets.events.push(note)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
-            outlets.stats["position_error_mm"] = round(min(self._truth.position.final, 1e12) * 1000.0)
+            if self._truth.position.count:
+                outlets.stats["position_error_mm"] = round(min(self._truth.position.final, 1e12) * 1000.0)
         if self._trace is not None:
             self._trace.add(rows)
 
@@ -257,6 +260,7 @@ class Loop:
         """What the summary needs beyond the shared counters."""
         result: dict[str, Any] = {
             "mode": self.navigator.mode.name.lower(),
+            "navigation_digest": self._digest.hexdigest(),
             "gyro_bias_deg_h": [float(b) for b in np.degrees(self.navigator.gyro_bias) * 3600.0],
             "head": self.driver.identity(),
         }
@@ -349,6 +353,3 @@ def _record(taken: FrameArray, outlets: Outlets, paced: bool) -> None:
     while not paced and ring.count + len(taken) - control.recorded > ring.capacity and not control.stop:
         time.sleep(0.001)
     ring.push(taken)
-
-
-__all__ = ["EVENTS", "LoopOrder", "Loop", "Mode", "Outlets", "Validity", "run_loop", "settings_of"]

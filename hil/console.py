@@ -85,7 +85,7 @@ class RunView:
             parts.append(str(health.name).lower().replace("|", "+"))
         if mode >= Mode.NAVIGATE:
             heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(state["q_nb"]))
-            parts.append(f"hdg {heading:6.2f} pitch {pitch:6.2f} roll {roll:7.2f} deg")
+            parts.append(f"hdg {round(heading, 2) % 360:6.2f} pitch {pitch:6.2f} roll {roll:7.2f} deg")
             speed = math.hypot(*state["vel_n"])
             parts.append(f"{speed:.1f} m/s  {state['height']:.0f} m")
         if stats["position_error_mm"] >= 0:
@@ -115,9 +115,11 @@ def print_summary(summary: dict[str, Any]) -> None:
         ("MAVLink messages sent", str(sum(summary["mavlink_sent"].values()))),
     ):
         table.add_row(name, value)
-    for name in ("recorded", "recorder_lost", "problem"):
-        if summary.get(name):
-            table.add_row(name.replace("_", " "), escape(str(summary[name])))
+    if "recorder" in summary:
+        recorder = summary["recorder"]
+        table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")
+    if "problem" in summary:
+        table.add_row("problem", escape(summary["problem"]))
     console.print(table)
     for key, title in (
         ("error", "error against the simulated truth"),

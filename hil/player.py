@@ -58,10 +58,9 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         reader.close()
         scenario = load(scenario_file) if scenario_file else Scenario.model_validate(reader.header["scenario"])
     elif path.suffix.lower() in {".log", ".blf", ".asc", ".trc", ".csv"}:
-        scenario = load(scenario_file)
+        scenario = load(scenario_file).with_changes(duration_s=None)
     else:
         raise HilError(f"replay {path}: unknown kind; there is: our own recordings, .ulg, candump .log, .blf, .asc")
-    scenario = scenario.with_changes(duration_s=None)
     if bus is not None:
         return LoopOrder(scenario.with_changes(bus=bus), paced=paced), True
     return LoopOrder(scenario, file=path, paced=paced), False

@@ -39,7 +39,7 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
                     wake.clear()
             writer.flush()
             stats["recorded"] = writer.written
-        answer.send({"recorded": writer.written, "lost": lost})
+        answer.send({"file": str(path), "frames": writer.written, "lost": lost})
     except (HilError, OSError) as error:
         control.recorded = 1 << 62  # the loop must not wait for us
         answer.send({"failed": f"recorder: {error}"})

@@ -263,19 +263,16 @@ class Session:
         result["wall_s"], result["device_s"] = wall, device_s
         result["speed"] = device_s / wall if wall else 0.0
         result["latency_us"] = stats.latency_us()
-        result["mavlink_sent"] = {}
         for name in ("loop", "feeder", "publisher", "recorder"):
             part = self._parts.get(name)
             if part is not None:
                 part.read()
                 answers = {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
-                if name == "feeder":
-                    result["head_sent"] = answers.get("sent", 0)
-                    result["head_dropped"] = answers.get("dropped", 0)
-                else:
+                if name == "loop":
                     result.update(answers)
-        if self._record is not None:
-            result["recorder_lost"] = stats["recorder_lost"]
+                else:
+                    result[name] = answers
+        result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
         if self.problems:
             result["problems"] = self.problems
         return result

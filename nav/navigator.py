@@ -194,14 +194,15 @@ class Navigator:
         used, event = rest.accumulate(
             self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], goal
         )
-        part = rows[start : start + used]
-        time = float(imu.time[start + used - 1])
+        last = start + used - 1
+        self._fill_constant(rows[start:last])  # what a block brings shows from its last sample on
+        time = float(imu.time[last])
         if event == 3:
             self._complain(time, Health.MOVING, "alignment waits: the vehicle moves")
         elif event:
             self._judge(time, event == 2)
         self._progress = 1.0 if self.mode == Mode.NAVIGATE else rest.progress(self._sums, goal)
-        self._fill_constant(part)
+        self._fill_constant(rows[last : last + 1])
         return used
 
     def _judge(self, time: float, complete: bool) -> None:

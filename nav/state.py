@@ -40,10 +40,10 @@ class Health(IntFlag):
 
 NAV_STATE = np.dtype(
     [
-        ("time", "<f8"),  # device time, s
-        ("sequence", "<i8"),  # sample counter of the device, unwrapped
         ("arrival_ns", "<i8"),  # host clock (UTC, ns) when the sample's last frame was sent or received
         ("solution_ns", "<i8"),  # host clock (UTC, ns) when the solution was put into the ring
+        ("time", "<f8"),  # device time, s
+        ("sequence", "<i8"),  # sample counter of the device, unwrapped
         ("mode", "<i4"),
         ("health", "<i4"),
         ("lat", "<f8"),  # geodetic, rad
@@ -58,3 +58,6 @@ NAV_STATE = np.dtype(
     ]
 )
 """One solution. Until the mode is NAVIGATE or DEGRADED, position is the configured start and velocity is zero."""
+
+HOST_FIELDS = 16
+"""Bytes at the start of a row that belong to the host's clock; all that follows is the same in every replay."""
