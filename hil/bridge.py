@@ -47,7 +47,6 @@ TICK_S = 0.02
 """Longest wait for a frame."""
 EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
 """A message for the user, as it lies in the ring of events."""
-_COUNTED = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors", "restarts")
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +240,11 @@ class Loop:
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
             note = np.zeros(1, EVENTS)
-            note["time"], note["severity"], note["text"] = event.time, event.severity.encode(), event.text.encode()[:240]
+            note["time"], note["severity"], note["text"] = (
+                event.time,
+                event.severity.encode(),
+                event.text.encode()[:240],
+            )
             outlets.events.push(note)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
@@ -251,9 +254,8 @@ class Loop:
             self._trace.add(rows)
 
     def _count(self) -> None:
-        stats, counters = self._outlets.stats, self.driver.counters
-        for name in _COUNTED:
-            stats[name] = getattr(counters, name)
+        counters = self.driver.counters
+        self._outlets.stats.set_block("frames", counters.as_list())
         self._outlets.control.set_loss(counters.lost, counters.samples)
 
     def result(self) -> dict[str, Any]:

@@ -29,10 +29,13 @@ Duration = Annotated[float | None, typer.Option(min=0.0, help="Seconds of device
 Speed = Annotated[str, typer.Option(help="1: real time; max: simulated time, as fast as it goes.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the simulated errors.")]
 Links = Annotated[
-    list[str] | None, typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none.")
+    list[str] | None,
+    typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
-Asserts = Annotated[list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")]
+Asserts = Annotated[
+    list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
+]
 Junit = Annotated[Path | None, typer.Option(help="Write the assertions as JUnit XML.")]
 ScenarioName = Annotated[str | None, typer.Argument(help="TOML file or built-in name; left out: the embedded default.")]
 
@@ -56,7 +59,9 @@ def run(
     from hil.scenario import load
     from hil.session import simulated_head
 
-    chosen = load(scenario).with_changes(**_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink))
+    chosen = load(scenario).with_changes(
+        **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
+    )
     order = LoopOrder(chosen, paced=_paced(speed))
     outside = bus is not None or imu is not None
     if outside and not order.paced:
@@ -200,7 +205,11 @@ def doctor(as_json: Json = False) -> None:
     colours = {"ok": "green", "lack": "yellow", "info": "cyan"}
     for finding in findings:
         table.add_row(
-            f"[{colours[finding.verdict]}]{finding.verdict}[/]", finding.what, finding.found, finding.mend, end_section=False
+            f"[{colours[finding.verdict]}]{finding.verdict}[/]",
+            finding.what,
+            finding.found,
+            finding.mend,
+            end_section=False,
         )
     Console(highlight=False).print(table)
 
@@ -215,7 +224,11 @@ def bench(as_json: Json = False) -> None:
         print(json.dumps({"rows": rows}))
         return
     for row in rows:
-        ratio = "" if row["peer_ns"] is None else f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        ratio = (
+            ""
+            if row["peer_ns"] is None
+            else f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        )
         print(f"{row['id']:24} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
@@ -326,5 +339,3 @@ def main() -> None:
         for line in str(error).splitlines():
             _say(f"hil: {line}")
         raise SystemExit(1 if isinstance(error, RunFailed) else 2) from None
-
-

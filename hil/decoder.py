@@ -1,6 +1,7 @@
 """Frames without navigation: decoding a file to JSON lines, recording a bus."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,7 +31,10 @@ def decode_file(driver_name: str, path: Path) -> tuple[Iterator[str], Callable[[
             good = batch[:n][batch["reserved"][:n, 0] != EVENT]
             samples = driver.decode(good)
             for k in range(len(samples)):
-                yield json.dumps({name: _plain(getattr(samples, name)[k]) for name in _FIELDS if hasattr(samples, name)}) + "\n"
+                yield (
+                    json.dumps({name: _plain(getattr(samples, name)[k]) for name in _FIELDS if hasattr(samples, name)})
+                    + "\n"
+                )
 
     return lines(), driver.counters.as_dict, source.problem
 
@@ -39,7 +43,7 @@ def _plain(value: Any) -> Any:
     """A JSON value; NaN (not on this wire) is null."""
     listed = value.tolist()
     if isinstance(listed, list):
-        return [None if item != item else item for item in listed]
+        return [None if math.isnan(item) else item for item in listed]
     return listed
 
 

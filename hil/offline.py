@@ -87,7 +87,7 @@ def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
 
 def _parquet() -> Any:
     try:
-        import pyarrow.parquet as parquet
+        from pyarrow import parquet
     except ImportError as error:
         raise HilError("parquet files need pyarrow: pip install pyarrow, or use .csv or .npz") from error
     return parquet

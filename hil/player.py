@@ -45,9 +45,9 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         log = read_ulog(path)
         scenario = load(scenario_file) if scenario_file else _board_scenario(path, log)
         reference = Reference(
-            time=log.attitude_us * 1e-6,
+            time=np.asarray(log.attitude_us * 1e-6, float),
             q_nb=log.attitude,
-            gyro_time=log.time_us * 1e-6,
+            gyro_time=np.asarray(log.time_us * 1e-6, float),
             gyro=log.rate,
             start=float(log.time_us[0]) * 1e-6,
         )
@@ -68,7 +68,7 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
 
 def _board_scenario(path: Path, log: ImuLog) -> Scenario:
     """For a board that cannot gyrocompass: level at the start, heading from the log's own estimate, bias kept at rest."""
-    times = log.attitude_us * 1e-6
+    times = np.asarray(log.attitude_us * 1e-6, float)
     at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
     heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])
     return Scenario.model_validate(

@@ -124,7 +124,9 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            launch("publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, self._publisher_stop)
+            launch(
+                "publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, self._publisher_stop
+            )
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -206,7 +208,8 @@ class Session:
         copied, first = self.outlets.events.pull(rows, self._event_number)
         self._event_number = first + copied
         return [
-            (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace")) for row in rows[:copied]
+            (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace"))
+            for row in rows[:copied]
         ]
 
     def stop(self) -> None:

@@ -1,5 +1,6 @@
 """Counters of a run in shared memory: written by the loop alone, read by the status line, the publisher and the summary."""
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -56,11 +57,17 @@ class Stats:
         self._shared = shared or Shared(STATS.itemsize)
         self.record: Any = np.frombuffer(self._shared.memory, STATS, 1)
         self._latency = self.record["latency"][0]
+        self._words = np.frombuffer(self._shared.memory, np.int64, len(_FIELDS))
         if shared is None:
             self.record["position_error_mm"] = -1
 
     def __reduce__(self) -> Any:
         return Stats, (self._shared,)
+
+    def set_block(self, first: str, values: Sequence[int]) -> None:
+        """Set the fields from `first` on."""
+        start = _FIELDS.index(first)
+        self._words[start : start + len(values)] = values
 
     def __getitem__(self, name: str) -> int:
         return int(self.record[name][0])
@@ -73,8 +80,7 @@ class Stats:
         for value in latencies_ns:
             microseconds = max(0, int(value) // 1000)
             self._latency[min(microseconds, LATENCY_BINS - 1)] += 1
-            if microseconds > self.record["latency_max_us"][0]:
-                self.record["latency_max_us"][0] = microseconds
+            self.record["latency_max_us"][0] = max(self.record["latency_max_us"][0], microseconds)
 
     def latency_us(self) -> dict[str, float]:
         """p50, p99, p999 and max of the latency, us; zeros when none was counted."""

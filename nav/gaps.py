@@ -63,11 +63,14 @@ class GapFiller:
             return imu, []
         before = self._sequence
         last = len(imu) - 1
-        jumps = np.flatnonzero(np.diff(imu.sequence) != 1) + 1
-        if before is not None and imu.sequence[0] != before + 1:
-            jumps = np.concatenate(([0], jumps))
-        result, gaps = (imu, []) if len(jumps) == 0 else self._filled(imu, jumps)
-        self._sequence = int(imu.sequence[last])
+        first, newest = int(imu.sequence[0]), int(imu.sequence[last])
+        follows = before is None or first == before + 1
+        result = imu
+        gaps: list[Gap] = []
+        if not follows or newest - first != last:  # the driver hands samples on in rising order
+            jumps = np.flatnonzero(np.diff(imu.sequence) != 1) + 1
+            result, gaps = self._filled(imu, jumps if follows else np.concatenate(([0], jumps)))
+        self._sequence = newest
         self._time = float(imu.time[last])
         self._keep(imu, last)
         return result, gaps
@@ -118,7 +121,7 @@ class GapFiller:
         mark = int(Validity.INTERPOLATED | (Validity.BRIDGED if bridged else Validity.GOOD))
         numbers = sequence + 1 + (np.arange(count) * max(missing, 1)) // count
         return ImuIncrements(
-            time + step * np.arange(1, count + 1),
+            time + step * np.arange(1.0, count + 1.0),
             np.full(count, step),
             rate * step,
             force * step,

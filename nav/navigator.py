@@ -96,9 +96,7 @@ class Navigator:
         self.heading = settings.heading
         self._filler = GapFiller(settings.gaps)
         self._sums = np.zeros(rest.SUMS)
-        self._state = geographic.initial_state(
-            settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4)
-        )
+        self._state = geographic.initial_state(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
         self._progress = 0.0
         self._events: list[Event] = []
         self._rows = np.zeros(256, NAV_STATE)
@@ -122,7 +120,8 @@ class Navigator:
         self.health &= ~(Health.BRIDGED | Health.MOVING | Health.UNITS | Health.RATE_TOO_SMALL)
         self._sums[:] = 0.0
         self._progress = 0.0
-        self._state = geographic.initial_state(*self._state[:3], np.zeros(3), np.zeros(4))
+        lat, lon, height = self._state[:3]
+        self._state = geographic.initial_state(lat, lon, height, np.zeros(3), np.zeros(4))
         self._say(time, "notice", f"aligning: {reason}")
 
     def silent(self) -> StateArray:
@@ -143,9 +142,9 @@ class Navigator:
         HilError
             An increment is not finite.
         """
-        if not math.isfinite(float(imu.dtheta.sum()) + float(imu.dvel.sum()) + float(imu.time.sum())):
-            bad = ~(np.isfinite(imu.dtheta).all(1) & np.isfinite(imu.dvel).all(1) & np.isfinite(imu.time))
-            raise HilError(f"increment {int(imu.sequence[bad][0])} is not a number: mend the driver or the file")
+        bad = imu.first_bad()
+        if bad >= 0:
+            raise HilError(f"increment {int(imu.sequence[bad])} is not a number: mend the driver or the file")
         imu, gaps = self._filler.fill(imu)
         n = len(imu)
         if n == 0:

@@ -119,7 +119,12 @@ def _track(
 
 @kernel
 def _join(
-    kind: IntArray, data: NDArray[np.uint8], partial: NDArray[np.uint8], state: IntArray, joined: NDArray[np.uint8], last: IntArray
+    kind: IntArray,
+    data: NDArray[np.uint8],
+    partial: NDArray[np.uint8],
+    state: IntArray,
+    joined: NDArray[np.uint8],
+    last: IntArray,
 ) -> tuple[int, int]:
     """Collect the six classic frames of a sample; returns (complete samples, duplicate frames)."""
     n = duplicates = 0
@@ -238,7 +243,11 @@ class DtgHead:
             result.rotor[invalid] = np.nan
         self._arrivals = times[rows]
         counters, outcome = self.counters, self._outcome
-        counters.samples, counters.lost, counters.late = int(outcome[_SAMPLES]), int(outcome[_LOST]), int(outcome[_LATE])
+        counters.samples, counters.lost, counters.late = (
+            int(outcome[_SAMPLES]),
+            int(outcome[_LOST]),
+            int(outcome[_LATE]),
+        )
         counters.restarts = int(outcome[_RESTARTS])
         counters.duplicated += int(outcome[_DUPLICATED])
         counters.crc_errors += int(outcome[_CRC])

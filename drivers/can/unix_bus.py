@@ -121,7 +121,7 @@ class UnixPort:
         """Fill `batch` (at least `PACKET` long) with what is there; waits up to `timeout` s for the first frame."""
         filled = 0
         deadline = time.monotonic() + timeout
-        view = memoryview(batch.view(np.uint8))
+        view = batch.view(np.uint8).data
         while filled == 0:
             ready = self._epoll.poll(max(0.0, deadline - time.monotonic()))
             if not ready:

@@ -107,7 +107,7 @@ def advance(
             velocity[k, i] = vel[i]
         for i in range(4):
             attitude[k, i] = q[i]
-    return step.shape[0]
+    return len(step)
 
 
 @inline_kernel
@@ -178,4 +178,3 @@ def _step(
     from_rotation_vector(-zx, -zy, -zz, delta)
     multiply(delta, q, q)
     normalise(q)
-
