@@ -52,12 +52,15 @@ def run(
     record: Record = None,
     assertion: Asserts = None,
     junit: Junit = None,
+    no_dashboard: Annotated[bool, typer.Option("--no-dashboard", help="Serve no dashboard (this version has none).")] = False,
     as_json: Json = False,
 ) -> None:
     """Run the bridge: IMU in, navigation, MAVLink out. Without --bus and --imu it brings its own simulated head."""
     from hil.bridge import LoopOrder
     from hil.scenario import load
     from hil.session import simulated_head
+
+    del no_dashboard  # accepted, so that command lines stay valid
 
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
