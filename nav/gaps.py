@@ -76,10 +76,11 @@ class GapFiller:
         return result, gaps
 
     def _keep(self, imu: ImuIncrements, row: int) -> None:
-        step = imu.step[row]
-        if step > 0.0:
-            self._rate[:] = imu.dtheta[row] / step
-            self._force[:] = imu.dvel[row] / step
+        while row >= 0 and imu.step[row] <= 0.0:  # a sample without length has no rate: the one before it counts
+            row -= 1
+        if row >= 0:
+            self._rate[:] = imu.dtheta[row] / imu.step[row]
+            self._force[:] = imu.dvel[row] / imu.step[row]
 
     def _filled(self, imu: ImuIncrements, jumps: np.ndarray) -> tuple[ImuIncrements, list[Gap]]:
         parts: list[ImuIncrements] = []

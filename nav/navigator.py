@@ -110,6 +110,7 @@ class Navigator:
     def begin(self, lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, time: float) -> None:
         """Navigate from a known state (position rad and m, velocity m/s, attitude) instead of aligning."""
         self._state = geographic.initial_state(lat, lon, height, vel_n, q_nb)
+        self._sums[:] = 0.0
         self._progress = 1.0
         self._say(time, "info", "navigating from a given start")
         self.mode = Mode.NAVIGATE
@@ -200,7 +201,7 @@ class Navigator:
             self._complain(time, Health.MOVING, "alignment waits: the vehicle moves")
         elif event:
             self._judge(time, event == 2)
-        self._progress = 1.0 if self.mode == Mode.NAVIGATE else rest.progress(self._sums, goal)
+        self._progress = rest.progress(self._sums, goal) if self.mode == Mode.ALIGN else 1.0
         self._fill_constant(rows[last : last + 1])
         return used
 
@@ -236,6 +237,7 @@ class Navigator:
             f"aligned in {mean.time_s:.1f} s: heading {heading:.3f} pitch {pitch:.3f} roll {roll:.3f} deg, "
             f"{np.linalg.norm(mean.f) / 9.80665:.3f} g",
         )
+        self._trust(time)
 
     def _navigate(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
         event = 0
