@@ -34,7 +34,7 @@ from hil.warmup import warm_loop
 from hil.world.truth import TruthKeeper
 from nav.errors import HilError
 from nav.gaps import GapPolicy
-from nav.increments import HeadIncrements, ImuIncrements
+from nav.increments import HeadIncrements, ImuIncrements, IntArray
 from nav.instruments.head import HeadCombiner
 from nav.lever_arm import shift
 from nav.navigator import Navigator, Settings
@@ -137,6 +137,7 @@ class Loop:
         self._keep_trace = order.keep_trace
         self._clock = ClockMap()
         self._restarts = 0
+        self._arrival_ns = 0
         self._started: float | None = None
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
@@ -156,22 +157,35 @@ class Loop:
         self._count()
         if len(raw) == 0:
             return False
-        if driver.counters.restarts != self._restarts:
+        arrivals, start = driver.arrivals(), 0
+        if driver.counters.restarts != self._restarts:  # its clock begins anew, maybe in the middle of the batch
             self._restarts = driver.counters.restarts
+            for stop in (np.flatnonzero(np.diff(raw.time) < 0.0) + 1).tolist():
+                self._pass(raw.rows(start, stop), arrivals[start:stop])
+                start, self._started = stop, None
             self._clock.reset()
             self._started = None
-        arrivals = driver.arrivals()
+        self._pass(raw.rows(start, len(raw)), arrivals[start:])
+        return True
+
+    def _pass(self, raw: HeadIncrements | ImuIncrements, arrivals: IntArray) -> None:
+        """Navigate samples of one life of the device."""
+        if self.finished:
+            return
         raw = self._cut(raw)
-        if self._truth is None and driver.world_id == self._world:
+        if len(raw) == 0:
+            return
+        if self._truth is None and self.driver.world_id == self._world:
             self._truth = TruthKeeper(self.scenario)
         if self._from_truth and not self._begin(raw):
-            return True
+            return
         imu = self._combiner.combine(raw) if isinstance(raw, HeadIncrements) else raw
         rows = self.navigator.process(imu)
         if self._arm.any():
             position = rows["lat"], rows["lon"], rows["height"]
             shift(*position, rows["vel_n"], rows["q_nb"], rows["w_ib_b"], self._arm)
         rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
+        self._arrival_ns = int(arrivals[-1])
         self._publish(rows)
         stats = self._outlets.stats
         if self._live:
@@ -179,7 +193,6 @@ class Loop:
             stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
         if len(rows) != len(imu):
             stats["interpolated"] += len(rows) - len(imu)
-        return True
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
         """Up to the scenario's duration, counted from the first sample."""
@@ -216,7 +229,12 @@ class Loop:
     def obey(self, event: int) -> None:
         """Repeat an event: silence, or an ordered alignment."""
         if event == SILENCE:
-            self._publish(self.navigator.silent())
+            rows = self.navigator.silent().copy()  # repeats the navigated point of the head: the navigator knows no arm
+            if self._arm.any():
+                position = rows["lat"], rows["lon"], rows["height"]
+                shift(*position, rows["vel_n"], rows["q_nb"], rows["w_ib_b"], self._arm)
+            rows["arrival_ns"] = self._arrival_ns
+            self._publish(rows)
             self._outlets.stats["silences"] += 1
         elif event == REALIGN:
             self.navigator.realign(self._last_time(), "ordered")

@@ -225,7 +225,7 @@ class Session:
                 failed = f"the {part.name} process died (exit code {part.process.exitcode})"
             if not failed:
                 continue
-            if part.name in {"loop", "feeder"} or (part.name == "publisher" and not self.outlets.control.go):
+            if part.name in {"loop", "feeder"} or not self.outlets.control.go:
                 raise HilError(str(failed))
             if failed not in self.problems:
                 self.problems.append(str(failed))
