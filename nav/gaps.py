@@ -99,7 +99,7 @@ class GapFiller:
             step = float(imu.step[stop])
             length = float(imu.time[stop]) - step - time
             missing = int(imu.sequence[stop]) - sequence - 1
-            realign = length > self.policy.realign_s or length < 0.0 or step <= 0.0
+            realign = length > self.policy.realign_s or length < -1e-9 or step <= 0.0
             gaps.append(Gap(rows, time, length, missing, realign))
             if not realign and length > 1e-9:
                 bridged = length > self.policy.interpolate_s

@@ -138,9 +138,13 @@ def _step(
     lat, height = state[0], state[2]
     sin_lat, cos_lat = math.sin(lat), math.cos(lat)
     meridian, prime = curvature_radii(sin_lat)
-    # Mid-step velocity: half of the increment and of gravity; Coriolis there is below second order.
+    # Mid-step velocity: half of the increment, of gravity and of Coriolis, all as at the step's start.
+    local_rate(sin_lat, cos_lat, height, vel, w)
+    gx, gy, gz = (2.0 * w[0] + w[3]) * dt, (2.0 * w[1] + w[4]) * dt, (2.0 * w[2] + w[5]) * dt
     gravity = normal_gravity(sin_lat, height)
-    mid[0], mid[1], mid[2] = vel[0] + 0.5 * new[0], vel[1] + 0.5 * new[1], vel[2] + 0.5 * (new[2] + gravity * dt)
+    mid[0] = vel[0] + 0.5 * (new[0] - gy * vel[2] + gz * vel[1])
+    mid[1] = vel[1] + 0.5 * (new[1] - gz * vel[0] + gx * vel[2])
+    mid[2] = vel[2] + 0.5 * (new[2] - gx * vel[1] + gy * vel[0] + gravity * dt)
     mid_height = height - 0.5 * dt * mid[2]
     mid_lat = lat + 0.5 * dt * mid[0] / (meridian + height)
     sin_lat, cos_lat = math.sin(mid_lat), math.cos(mid_lat)

@@ -89,7 +89,9 @@ def test_gimbal_lock_still_describes_the_attitude(heading, roll, sign, away):
     q = quaternion_from_euler(heading, sign * (0.5 * math.pi - away), roll)
     angles_back = euler_from_quaternion(q)
     again = quaternion_from_euler(*angles_back)
-    assert angle_between(again, Rotation.from_quat(q, scalar_first=True)) < 3e-6  # twice the width in which roll is taken as 0
+    assert (
+        angle_between(again, Rotation.from_quat(q, scalar_first=True)) < 3e-6
+    )  # twice the width in which roll is taken as 0
     assert all(math.isfinite(angle) for angle in angles_back)
 
 
