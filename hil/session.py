@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
+from hil.control import run_part
 from hil.publisher import run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -111,7 +112,9 @@ class Session:
 
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
-            process = context.Process(target=target, args=(*args, theirs), name=f"hil-{name}", daemon=True)
+            process = context.Process(
+                target=run_part, args=(outlets.control, target, *args, theirs), name=f"hil-{name}", daemon=True
+            )
             process.start()
             theirs.close()
             self._parts[name] = _Part(name, process, ours)
