@@ -157,7 +157,7 @@ class Scenario(_Model):
 
     def with_changes(self, **changes: Any) -> "Scenario":
         """A copy with `changes` laid over it (nested dictionaries reach nested keys), validated anew."""
-        return _validated(_merged(self.model_dump(mode="json"), changes), "command line")
+        return validated(_merged(self.model_dump(mode="json"), changes), "command line")
 
     def world_id(self) -> int:
         """A 32-bit fingerprint of what the simulated head does: motion, head and seed; never 0.
@@ -204,7 +204,7 @@ def parse(text: str, source: str) -> Scenario:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise HilError(f"scenario {source}: not TOML: {error}") from error
-    return _validated(table, source)
+    return validated(table, source)
 
 
 def built_in_names() -> list[str]:
@@ -213,7 +213,14 @@ def built_in_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def _validated(table: Mapping[str, Any], source: str) -> Scenario:
+def validated(table: Mapping[str, Any], source: str) -> Scenario:
+    """The scenario in a table of plain values; `source` names it in errors.
+
+    Raises
+    ------
+    HilError
+        A key is unknown or has a wrong value.
+    """
     try:
         return Scenario.model_validate(table)
     except ValidationError as error:
