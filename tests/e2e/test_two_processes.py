@@ -143,6 +143,7 @@ def test_duration_ends_both(start: Callable[..., Program]) -> None:
     assert summary["latency_us"]["p50"] > 0
 
 
+@pytest.mark.slow
 def test_other_world_is_navigated_but_not_judged(start: Callable[..., Program]) -> None:
     bus = bus_name("world")
     bridge = Program("run", "rest", "--bus", bus, "--mavlink", "none")
@@ -259,22 +260,13 @@ def test_missing_interface_is_named_with_its_mend(command: str, tmp_path: Path) 
         assert "no interface vcan9; make it with: sudo sh -c 'ip link add vcan9 type vcan" in line
 
 
-def test_port_in_use_is_named() -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        url = f"tcpin:127.0.0.1:{taken.getsockname()[1]}"
-        line = refusal("run", "--duration", 1, "--mavlink", url)
-    assert url in line
-    assert "in use" in line.lower()
-
-
 def test_wrong_key_is_named(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
     file.write_text(SCENARIO.replace("rate_hz", "rate_khz"))
     assert refusal("imu", file) == f"hil: scenario {file}: head.rate_khz = 500: unknown key"
 
 
+@pytest.mark.slow
 def test_what_the_head_sends_is_what_the_driver_reads(start: Callable[..., Program], tmp_path: Path) -> None:
     """``hil record`` as a third participant hears all that the bridge hears."""
     bus, file = bus_name("third"), tmp_path / "third.dhil"

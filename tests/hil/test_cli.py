@@ -268,7 +268,9 @@ def test_decode_into_a_closed_pipe(tmp_path: Path) -> None:
         assert process.stderr.read() == ""
 
 
-@pytest.mark.parametrize("ending", [".dhil", ".log", ".blf", ".asc"])
+@pytest.mark.parametrize(
+    "ending", [".dhil", *(pytest.param(e, marks=pytest.mark.slow) for e in (".log", ".blf", ".asc"))]
+)
 def test_record_writes_what_was_on_the_bus(hil: Cli, tmp_path: Path, ending: str) -> None:
     file, bus = tmp_path / f"bus{ending}", f"unix:t-record{ending}"
     head = subprocess.Popen(
