@@ -14,7 +14,7 @@ from nav.increments import HeadIncrements, ImuIncrements, IntArray
 
 @dataclass(slots=True)
 class Counters:
-    """What became of the frames that came in. ``sent = samples + lost`` for the samples between the first and the last."""
+    """What became of the frames that came in. Samples sent from the first to the last are ``samples + lost + late``."""
 
     frames: int = 0
     """Frames of any kind."""

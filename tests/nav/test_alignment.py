@@ -102,7 +102,7 @@ def test_level_alignment_captures_the_gyro_bias(heading, pitch, roll, lat, bias)
 def test_refusals_say_why_and_what_to_do(lat_deg, sigma_w, bias, say):
     f, w = at_rest(Rotation.from_euler("ZYX", [30, 2, -3], degrees=True), math.radians(lat_deg))
     with pytest.raises(AlignmentRefused) as refusal:
-        gyrocompass(f, w + [bias, 0, 0], math.radians(lat_deg), 0.0, sigma_w)
+        gyrocompass(f, w + np.array([bias, 0.0, 0.0]), math.radians(lat_deg), 0.0, sigma_w)
     assert say in str(refusal.value)
 
 
@@ -171,7 +171,7 @@ def test_motion_restarts_the_averages(rate, force):
     rates = np.zeros((1000, 3))
     forces = np.tile([0.0, 0.0, -9.8], (1000, 1))
     rates[400:], forces[400:] = rate, forces[400:] + force
-    sums, events = average(rates, forces, 5.0)
+    _, events = average(rates, forces, 5.0)
     assert 3 in [event for _, event in events]
     row = next(row for row, event in events if event == 3)
     assert 400 < row <= 450  # within the block of half a second

@@ -1,5 +1,7 @@
 """The gap policy at its limits, and that a stream gives the same rows however it is split."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -133,7 +135,7 @@ def test_splits_do_not_matter(lost, cuts, interpolate_s, realign_s):
     filler = GapFiller(policy)
     parts, met, rows = [], [], 0
     edges = [0, *sorted(min(cut, len(kept)) for cut in cuts), len(kept)]
-    for start, stop in zip(edges[:-1], edges[1:], strict=True):
+    for start, stop in pairwise(edges):
         part, new = filler.fill(imu.rows(start, stop))
         met += [(gap.row + rows, gap.time, gap.length_s, gap.missing, gap.realign) for gap in new]
         rows += len(part)

@@ -1,6 +1,7 @@
 """The navigator's modes, and that nothing it says depends on how samples were batched."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -214,7 +215,7 @@ def test_bias_is_tracked_at_rest_and_not_in_motion():
     rows = navigator.process(rest(60.0, first=250, bias=warm))
     np.testing.assert_allclose(rows["gyro_bias"][-1], warm, atol=3e-6)
     kept = navigator.gyro_bias.copy()
-    navigator.process(rest(20.0, first=6250, bias=warm + [0.0, 0.0, 0.05]))
+    navigator.process(rest(20.0, first=6250, bias=warm + np.array([0.0, 0.0, 0.05])))
     np.testing.assert_array_equal(navigator.gyro_bias, kept)
     still = aligned(LEVEL)
     still.process(rest(20.0, first=250, bias=warm))
@@ -252,7 +253,7 @@ def test_batches_do_not_matter(seed, cuts, choice):
     whole, split = Navigator(choice), Navigator(choice)
     expected = whole.process(imu).copy()
     edges = [0, *sorted(min(cut, len(imu)) for cut in cuts), len(imu)]
-    parts = [split.process(imu.rows(a, b)).copy() for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    parts = [split.process(imu.rows(a, b)).copy() for a, b in pairwise(edges)]
     assert np.concatenate(parts).tobytes() == expected.tobytes()
     assert split.events() == whole.events()
     assert split.mode == whole.mode
