@@ -46,7 +46,7 @@ def test_step_of_a_log_with_a_gap():
 def test_truncated_is_read_as_far_as_it_goes_or_refused(flight, tmp_path, share):
     whole = flight.read_bytes()
     (tmp_path / "cut.ulg").write_bytes(whole[: int(len(whole) * share)])
-    if share < 0.01:
+    if share <= 0.01:
         with pytest.raises(HilError, match=r"cut\.ulg"):
             read_ulog(tmp_path / "cut.ulg")
         return
