@@ -42,11 +42,11 @@ def test_step_of_a_log_with_a_gap():
     assert log.step_us.tolist() == [1000, 1000, 1010, 1000, 1000]
 
 
-@pytest.mark.parametrize("share", [0.0001, 0.001, 0.01, 0.5, 0.999])
+@pytest.mark.parametrize("share", [0.0001, 0.001, 0.3, 0.999])
 def test_truncated_is_read_as_far_as_it_goes_or_refused(flight, tmp_path, share):
     whole = flight.read_bytes()
     (tmp_path / "cut.ulg").write_bytes(whole[: int(len(whole) * share)])
-    if share <= 0.01:
+    if share < 0.01:
         with pytest.raises(HilError, match=r"cut\.ulg"):
             read_ulog(tmp_path / "cut.ulg")
         return
