@@ -33,6 +33,7 @@ def test_short_hop(hil_bridge: StartBridge, layout: str) -> None:
     assert summary["error"]["position_m"]["max"] < 0.05
 
 
+@pytest.mark.slow
 def test_the_seed_is_part_of_the_world(hil_bridge: StartBridge) -> None:
     digests = set()
     for seed in (1, 1, 2):

@@ -110,7 +110,7 @@ def test_replay_over_a_bus(recorded: tuple[Path, dict[str, Any]]) -> None:
     assert summary["navigation_digest"] == live["navigation_digest"]
 
 
-@pytest.mark.parametrize("speed", ["max", "1"])
+@pytest.mark.parametrize("speed", ["max", pytest.param("1", marks=pytest.mark.slow)])
 def test_silence_loss_and_restart_replay_alike(hil_bridge: StartBridge, tmp_path: Path, speed: str) -> None:
     """A live run with a lossy head that falls silent and starts anew; events are part of the recording."""
     from drivers.can.bus import open_port

@@ -189,6 +189,7 @@ def test_silence_degrades_in_time_and_ends(start: Callable[..., Program], tmp_pa
     assert min(delays) > SILENCE_S / 2
 
 
+@pytest.mark.slow
 def test_sudden_death_of_the_head(start: Callable[..., Program]) -> None:
     bus = bus_name("death")
     bridge = start("run", "--bus", bus)

@@ -308,7 +308,7 @@ def test_version(hil: Cli) -> None:
     assert out.startswith("dtg-hil ")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_stop_signal_ends_with_the_summary(number: int) -> None:
     command = [*HIL, "run", "--mavlink", "none", "--json"]
     with subprocess.Popen(
