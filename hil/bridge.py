@@ -36,7 +36,6 @@ from nav.errors import HilError
 from nav.gaps import GapPolicy
 from nav.increments import HeadIncrements, ImuIncrements, IntArray
 from nav.instruments.head import HeadCombiner
-from nav.lever_arm import shift
 from nav.navigator import Navigator, Settings
 from nav.rotation import dcm_from_quaternion, quaternion_from_euler
 from nav.state import HOST_FIELDS, NAV_STATE
@@ -111,6 +110,7 @@ def settings_of(scenario: Scenario) -> Settings:
         position_trusted=navigation.alignment != "level",
         attitude=navigation.attitude,
         mechanization=navigation.mechanization,
+        lever_arm=scenario.head.lever_arm_m,
         gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
     )
 
@@ -126,7 +126,6 @@ class Loop:
         self.finished = False
         """The scenario's duration is over."""
         head = scenario.head
-        self._arm = -np.asarray(head.lever_arm_m)
         self._combiner = HeadCombiner(dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))))
         self._outlets = outlets
         self._live = order.paced and order.file is None
@@ -139,6 +138,7 @@ class Loop:
         self._restarts = 0
         self._arrival_ns = 0
         self._started: float | None = None
+        self._covered = 0.0
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
@@ -181,9 +181,6 @@ class Loop:
             return
         imu = self._combiner.combine(raw) if isinstance(raw, HeadIncrements) else raw
         rows = self.navigator.process(imu)
-        if self._arm.any():
-            position = rows["lat"], rows["lon"], rows["height"]
-            shift(*position, rows["vel_n"], rows["q_nb"], rows["w_ib_b"], self._arm)
         rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
         self._arrival_ns = int(arrivals[-1])
         self._publish(rows)
@@ -195,16 +192,18 @@ class Loop:
             stats["interpolated"] += len(rows) - len(imu)
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
-        """Up to the scenario's duration, counted from the first sample."""
+        """Up to the scenario's duration: the device time covered so far, all lives of the device together."""
         if self._started is None:
-            self._started = float(raw.time[0] - raw.step[0])
-            self._outlets.stats["started_us"] = round(self._started * 1e6)
+            self._started = float(raw.time[0] - raw.step[0]) - self._covered
         duration = self.scenario.duration_s
         if duration is not None:
             end = self._started + duration + 1e-9
             if raw.time[-1] >= end - raw.step[-1]:
                 self.finished = True
-                return raw.rows(0, int(np.searchsorted(raw.time, end, "right")))
+                raw = raw.rows(0, int(np.searchsorted(raw.time, end, "right")))
+        if len(raw):
+            self._covered = float(raw.time[-1]) - self._started
+            self._outlets.stats["covered_us"] = round(self._covered * 1e6)
         return raw
 
     def _begin(self, raw: HeadIncrements | ImuIncrements) -> bool:
@@ -217,22 +216,16 @@ class Loop:
                 )
             return False
         truth = self._truth.motion.truth(np.array([raw.time[0] - raw.step[0]]))
-        if self._arm.any():
-            position = truth["lat"], truth["lon"], truth["height"]
-            shift(*position, truth["vel_n"], truth["q_nb"], truth["w_ib_b"], -self._arm)
         row = truth[0]
-        start = float(raw.time[0] - raw.step[0])
-        self.navigator.begin(row["lat"], row["lon"], row["height"], row["vel_n"], row["q_nb"], start)
+        position = row["lat"], row["lon"], row["height"]
+        self.navigator.begin(*position, row["vel_n"], row["q_nb"], float(row["time"]), row["w_ib_b"])
         self._from_truth = False
         return True
 
     def obey(self, event: int) -> None:
         """Repeat an event: silence, or an ordered alignment."""
         if event == SILENCE:
-            rows = self.navigator.silent().copy()  # repeats the navigated point of the head: the navigator knows no arm
-            if self._arm.any():
-                position = rows["lat"], rows["lon"], rows["height"]
-                shift(*position, rows["vel_n"], rows["q_nb"], rows["w_ib_b"], self._arm)
+            rows = self.navigator.silent()
             rows["arrival_ns"] = self._arrival_ns
             self._publish(rows)
             self._outlets.stats["silences"] += 1

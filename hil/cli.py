@@ -1,6 +1,7 @@
 """The command `hil`. Exit code 2 for a wrong request, 1 for a failed run, 0 otherwise; ``--json`` prints one object."""
 
 import json
+import os
 import signal
 import sys
 import time
@@ -15,6 +16,9 @@ from nav.errors import HilError
 if TYPE_CHECKING:
     from hil.bridge import LoopOrder
     from hil.session import Session
+
+COMMON_BUS = "unix:dtg-hil"
+"""Where `hil imu` and `hil run --imu` meet when no bus is named."""
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
 
@@ -52,10 +56,12 @@ def run(
     record: Record = None,
     assertion: Asserts = None,
     junit: Junit = None,
-    no_dashboard: Annotated[bool, typer.Option("--no-dashboard", help="Serve no dashboard (this version has none).")] = False,
+    no_dashboard: Annotated[
+        bool, typer.Option("--no-dashboard", help="Serve no dashboard (this version has none).")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Run the bridge: IMU in, navigation, MAVLink out. Without --bus and --imu it brings its own simulated head."""
+    """Run the bridge: IMU in, navigation, MAVLink out. Without a bus it brings its own simulated head."""
     from hil.bridge import LoopOrder
     from hil.scenario import load
     from hil.session import simulated_head
@@ -65,10 +71,15 @@ def run(
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
     )
-    order = LoopOrder(chosen, paced=_paced(speed))
-    outside = bus is not None or imu is not None
-    if outside and not order.paced:
-        raise HilError("--speed max needs the simulated head of this process: leave --bus and --imu out")
+    outside = bool(chosen.bus) or imu is not None
+    if outside and not _paced(speed):
+        raise HilError(
+            "--speed max needs the simulated head of `hil run`: leave --bus, --imu and the scenario's bus out"
+        )
+    order = LoopOrder(
+        chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
+        paced=_paced(speed),
+    )
     _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
 
 
@@ -86,6 +97,7 @@ def imu(
     from hil.world.head import SimulatedHead, feed
 
     chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
+    chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
     stop = _StopSignal()
     head = SimulatedHead(chosen)
     _say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
@@ -121,7 +133,7 @@ def replay(
         check_plot(plot)
         order = replace(order, keep_trace=True)
     feeder = (run_player, (log, order.scenario, order.paced)) if over_bus else None
-    summary = _run(order, feeder, record, assertion, junit, as_json=as_json, quiet_exit=plot is not None)
+    summary = _run(order, feeder, record, assertion, junit, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -182,14 +194,17 @@ def decode(
 def record(
     file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
     bus: Annotated[str, typer.Option(help="Bus URL.")],
+    scenario: Annotated[str | None, typer.Option(help="Scenario that a replay of this recording shall use.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds, then stop.")] = None,
     as_json: Json = False,
 ) -> None:
     """Record what is on the bus."""
     from hil.decoder import record_bus
+    from hil.scenario import load
 
     stop = _StopSignal()
-    _report(record_bus(bus, file, duration, lambda: stop.wanted), as_json=as_json)
+    chosen = load(scenario).with_changes(bus=bus)
+    _report(record_bus(chosen, file, duration, lambda: stop.wanted), as_json=as_json)
 
 
 @app.command()
@@ -251,7 +266,6 @@ def _run(
     junit: Path | None,
     *,
     as_json: bool,
-    quiet_exit: bool = False,
 ) -> dict[str, Any]:
     """Run a session to its end, show it, check the assertions; the summary."""
     from hil.assertions import parse, write_junit
@@ -270,6 +284,8 @@ def _run(
         try:
             _follow(session, stop, view)
         except HilError as error:
+            if session.outlets.stats["samples"] == 0:  # nothing was ever navigated: the request was wrong
+                raise
             raise RunFailed(str(error)) from error
     view.show_events()
     summary = session.summary()

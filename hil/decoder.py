@@ -14,6 +14,7 @@ from drivers.can.bus import open_port
 from drivers.can.convert import to_message
 from drivers.can.frames import frames
 from drivers.logs.recording import EVENT, RecordingWriter
+from hil.scenario import Scenario
 from hil.source import FileSource
 from nav.errors import HilError
 
@@ -47,13 +48,15 @@ def _plain(value: Any) -> Any:
     return listed
 
 
-def record_bus(url: str, path: Path, duration_s: float | None, cancelled: Callable[[], bool]) -> dict[str, Any]:
-    """Record frames of the bus until cancelled; what was recorded."""
-    port = open_port(url)
+def record_bus(
+    scenario: Scenario, path: Path, duration_s: float | None, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    """Record frames of the scenario's bus until cancelled; what was recorded."""
+    port = open_port(scenario.bus)
     batch = frames(1024)
     count, began = 0, time.monotonic()
     try:
-        with _writer(path, url) as write:
+        with _writer(path, scenario) as write:
             while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
                 n = port.receive(batch, 0.05)
                 write(batch[:n])
@@ -66,13 +69,11 @@ def record_bus(url: str, path: Path, duration_s: float | None, cancelled: Callab
 class _writer:
     """Our recording by the ending .dhil, python-can's writers by any other."""
 
-    def __init__(self, path: Path, url: str) -> None:
+    def __init__(self, path: Path, scenario: Scenario) -> None:
         self._own: RecordingWriter | None = None
         if path.suffix == ".dhil":
-            from hil.scenario import load
-
-            scenario = load(None).with_changes(bus=url).model_dump(mode="json")
-            self._own = RecordingWriter(path, {"scenario": scenario, "created_ns": time.time_ns()})
+            header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
+            self._own = RecordingWriter(path, header)
             return
         try:
             self._foreign: Any = can.Logger(path)

@@ -1,9 +1,10 @@
-"""`hil navigate`: strapdown navigation of logged increments, from file to file, as `guide` in docs/cli.md lays out."""
+"""`hil navigate`: strapdown navigation of logged increments, from file to file, as docs/cli.md lays out."""
 
 import math
 import tomllib
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,8 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(header)}") from error
+    except (ValueError, EOFError, BadZipFile) as error:  # not text, no archive, columns of unequal length
+        raise HilError(f"{path}: {error}") from error
     if len(table) == 0:
         raise HilError(f"{path}: no rows")
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
@@ -51,17 +54,32 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
 
 
 def _read_csv(path: Path, header: tuple[str, ...]) -> FloatArray:
-    with path.open() as file:
+    with path.open(encoding="utf-8") as file:
         first = tuple(name.strip() for name in file.readline().split(","))
         if first != header:
             raise HilError(f"{path}: line 1: the header is {','.join(first)!r}, expected {','.join(header)!r}")
         try:
-            table: FloatArray = np.loadtxt(file, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise HilError(f"{path}: {error} (rows are counted after the header)") from error
+            table: FloatArray = np.loadtxt(file, delimiter=",", ndmin=2, comments=None)
+        except ValueError:
+            raise HilError(f"{path}: {_first_bad_line(path, len(header))}") from None
     if table.size and table.shape[1] != len(header):
-        raise HilError(f"{path}: {table.shape[1]} columns, expected {len(header)}")
+        raise HilError(f"{path}: line 2: {table.shape[1]} columns, expected {len(header)}")
     return table.reshape(-1, len(header))
+
+
+def _first_bad_line(path: Path, columns: int) -> str:
+    with path.open(encoding="utf-8") as file:
+        next(file)
+        for number, line in enumerate(file, start=2):
+            values = line.split(",")
+            if line.strip() and len(values) != columns:
+                return f"line {number}: {len(values)} columns, expected {columns}"
+            for value in values:
+                try:
+                    float(value) if line.strip() else None
+                except ValueError:
+                    return f"line {number}: {value.strip()!r} is not a number"
+    return "it cannot be read as numbers"
 
 
 def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
@@ -76,9 +94,10 @@ def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
         if path.suffix.lower() == ".npz":
             np.savez(path, **{name: table[:, i] for i, name in enumerate(header)})  # type: ignore[arg-type]
         elif path.suffix.lower() == ".parquet":
+            parquet = _parquet()
             import pyarrow as pa
 
-            _parquet().write_table(pa.table({name: table[:, i] for i, name in enumerate(header)}), path)
+            parquet.write_table(pa.table({name: table[:, i] for i, name in enumerate(header)}), path)
         else:
             np.savetxt(path, table, fmt="%.17g", delimiter=",", header=",".join(header), comments="")
     except OSError as error:
@@ -134,8 +153,8 @@ def navigate(table: FloatArray, start: dict[str, float], attitude: str, mechaniz
     wrong = np.flatnonzero(step <= 0.0)
     if len(wrong):
         k = int(wrong[0])
-        before = start["time_s"] if k == 0 else time[k - 1]
-        raise HilError(f"row {k + 1}: time_s = {time[k]!r} does not come after {before!r}")
+        before = start["time_s"] if k == 0 else float(time[k - 1])
+        raise HilError(f"row {k + 1}: time_s = {float(time[k])} does not come after {before}")
     navigator = Navigator(Settings(attitude=attitude, mechanization=mechanization))
     navigator.begin(
         math.radians(start["lat_deg"]),

@@ -124,7 +124,7 @@ class NavigationConfig(_Model):
     """Gaps up to this length are filled by interpolation; longer ones are bridged and the mode is degraded."""
     gap_realign_s: Positive = 10.0
     """After a gap longer than this nothing is bridged: the navigator aligns again."""
-    silence_s: Annotated[float, Field(gt=0, le=10)] = 0.1
+    silence_s: Annotated[float, Field(gt=0, le=10)] = 0.08
     """Without a sample for this long the mode is degraded."""
     track_bias_at_rest: bool = False
     """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
@@ -148,7 +148,8 @@ class Scenario(_Model):
     description: str = ""
     duration_s: Positive | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    bus: str = "unix:dtg-hil"
+    bus: str = ""
+    """Where the sensor is; empty: `hil run` brings its own simulated head on a private ``unix:`` bus."""
     driver: str = "dtg-head"
     motion: MotionConfig = MotionConfig()
     head: HeadConfig = HeadConfig()

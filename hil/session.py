@@ -261,8 +261,7 @@ class Session:
         names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
         more = ("restarts", "interpolated", "silences")
         wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
-        state = self.state()
-        device_s = self.device_seconds(state)
+        device_s = stats["covered_us"] * 1e-6
         result: dict[str, Any] = {"scenario": self.order.scenario.name}
         result.update({name: stats[name] for name in (*names, *more)})
         result["rate_hz"] = stats["samples"] / device_s if device_s > 0 else 0.0
@@ -282,10 +281,6 @@ class Session:
         if self.problems:
             result["problems"] = self.problems
         return result
-
-    def device_seconds(self, state: Any) -> float:
-        """Device time that the samples since the head's last start cover."""
-        return 0.0 if state is None else float(state["time"]) - self.outlets.stats["started_us"] * 1e-6
 
 
 def simulated_head(order: LoopOrder) -> tuple[Callable[..., None], Sequence[Any]]:

@@ -43,7 +43,7 @@ _FIELDS = (
     "recorder_lost",
     "age_us",
     "position_error_mm",  # -1: no truth
-    "started_us",  # device time at which the first sample (of the head's last start) begins
+    "covered_us",  # device time from the first sample on, all lives of the device together
     "warm_loop",  # steps of `hil.warmup` that are done
     "warm_head",
 )
@@ -92,4 +92,7 @@ class Stats:
             name: float(np.searchsorted(cumulated, np.ceil(part * total)))
             for name, part in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999))
         }
-        return {**result, "max": float(self["latency_max_us"])}
+        longest = float(self["latency_max_us"])
+        if longest >= LATENCY_BINS - 1:  # the last bin says no more than that
+            result = {name: longest if value >= LATENCY_BINS - 1 else value for name, value in result.items()}
+        return {**result, "max": longest}

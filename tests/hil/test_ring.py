@@ -100,7 +100,6 @@ def test_latest_and_an_empty_ring():
     assert row["number"][0] == 22
 
 
-@pytest.mark.xfail(reason="Ring.push and Ring.pull cannot reshape an empty batch", raises=ValueError)
 def test_nothing_to_push_is_nothing():
     ring = Ring(ROW, 8)
     ring.push(rows(0, 0))

@@ -191,7 +191,6 @@ def test_lever_arm_and_mounting_do_not_show(hil_bridge: StartBridge) -> None:
     assert summary["error"]["attitude_deg"]["max"] < 1e-3
 
 
-@pytest.mark.xfail(strict=True, reason="the alignment takes the head for the navigated point: off by the lever arm")
 def test_lever_arm_does_not_show_after_an_alignment(hil_bridge: StartBridge) -> None:
     head = {"lever_arm_m": (1.5, -0.4, 0.7), "rate_hz": 200}
     bridge = hil_bridge(head=head, duration_s=25, paced=False, navigation={"align_s": 5})
