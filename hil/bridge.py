@@ -129,6 +129,7 @@ class Loop:
         self._combiner = HeadCombiner(dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))))
         self._outlets = outlets
         self._live = order.paced and order.file is None
+        self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
         self._truth: TruthKeeper | None = None
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
@@ -176,7 +177,7 @@ class Loop:
         if len(raw) == 0:
             return
         if self._truth is None and self.driver.world_id == self._world:
-            self._truth = TruthKeeper(self.scenario)
+            self._truth = self._own_truth
         if self._from_truth and not self._begin(raw):
             return
         imu = self._combiner.combine(raw) if isinstance(raw, HeadIncrements) else raw

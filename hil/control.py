@@ -83,11 +83,14 @@ class Control:
         self._values[_RECORDED] = count
 
 
-def run_part(control: Control, target: Callable[..., None], *args: Any) -> None:
+def run_part(control: Control, nice: int, target: Callable[..., None], *args: Any) -> None:
     """Target of every process of a run: calls ``target(*args)``, and has it stopped when the session is gone.
+
+    `nice` is how far it steps back behind the loop and the sensor where processors are few.
 
     A session that is killed cannot order anything: without this a simulated head would go on sending for ever.
     """
+    os.nice(nice)
     parent = mp.parent_process()
     if parent is not None:
         Thread(target=_outlive, args=(control, parent.sentinel), daemon=True).start()

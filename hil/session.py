@@ -31,6 +31,9 @@ from nav.state import NAV_STATE, Mode
 
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
+READERS = ("recorder", "publisher")
+"""Parts that only read what the loop gives."""
+READER_NICE = 10
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
 DRAIN_S = 1.0
@@ -113,7 +116,10 @@ class Session:
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
             process = context.Process(
-                target=run_part, args=(outlets.control, target, *args, theirs), name=f"hil-{name}", daemon=True
+                target=run_part,
+                args=(outlets.control, READER_NICE if name in READERS else 0, target, *args, theirs),
+                name=f"hil-{name}",
+                daemon=True,
             )
             process.start()
             theirs.close()

@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.ring import Shared
 
-LATENCY_BINS = 10_000
+LATENCY_BINS = 100_000
 """Bins of 1 us; the last one holds everything longer."""
 
 

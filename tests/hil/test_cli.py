@@ -102,7 +102,7 @@ BAD_TOML = "[navigation\nalign_s = 3"
             "scenario no-such: No such file or directory; give a TOML file or one of: coning, default",
         ),
         (["run", "--speed", "3"], "", "--speed 3: expected 1 or max"),
-        (["run", "--speed", "max", "--bus", "unix:a"], "", "--speed max needs the simulated head of this process"),
+        (["run", "--speed", "max", "--bus", "unix:a"], "", "--speed max needs the simulated head of `hil run`"),
         (["run", "--assert", "fast"], "", "expected KEY OP NUMBER"),
         (["run", "--assert", "lost < few"], "", "'few' is not a number"),
         (["run", "--junit", "x.xml"], "", "--junit needs at least one --assert"),
