@@ -140,6 +140,7 @@ class Loop:
         self._arrival_ns = 0
         self._started: float | None = None
         self._covered = 0.0
+        self._samples = 0
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
@@ -155,8 +156,8 @@ class Loop:
     def _take(self, batch: FrameArray) -> bool:
         driver = self.driver
         raw = driver.decode(batch)
-        self._count()
         if len(raw) == 0:
+            self._count()
             return False
         arrivals, start = driver.arrivals(), 0
         if driver.counters.restarts != self._restarts:  # its clock begins anew, maybe in the middle of the batch
@@ -167,6 +168,7 @@ class Loop:
             self._clock.reset()
             self._started = None
         self._pass(raw.rows(start, len(raw)), arrivals[start:])
+        self._count()
         return True
 
     def _pass(self, raw: HeadIncrements | ImuIncrements, arrivals: IntArray) -> None:
@@ -174,6 +176,7 @@ class Loop:
         if self.finished:
             return
         raw = self._cut(raw)
+        self._samples += len(raw)
         if len(raw) == 0:
             return
         if self._truth is None and self.driver.world_id == self._world:
@@ -268,7 +271,8 @@ class Loop:
     def _count(self) -> None:
         counters = self.driver.counters
         self._outlets.stats.set_block("frames", counters.as_list())
-        self._outlets.control.set_loss(counters.lost, counters.samples)
+        self._outlets.stats["samples"] = self._samples  # not those of the last batch that lie beyond the duration
+        self._outlets.control.set_loss(counters.lost, self._samples)
 
     def result(self) -> dict[str, Any]:
         """What the summary needs beyond the shared counters."""
