@@ -217,18 +217,14 @@ def doctor(as_json: Json = False) -> None:
         print(json.dumps({"findings": [finding.as_dict() for finding in findings]}))
         return
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     table = Table(show_header=False)
     colours = {"ok": "green", "lack": "yellow", "info": "cyan"}
     for finding in findings:
-        table.add_row(
-            f"[{colours[finding.verdict]}]{finding.verdict}[/]",
-            finding.what,
-            finding.found,
-            finding.mend,
-            end_section=False,
-        )
+        words = (escape(text) for text in (finding.what, finding.found, finding.mend))
+        table.add_row(f"[{colours[finding.verdict]}]{finding.verdict}[/]", *words)
     Console(highlight=False).print(table)
 
 

@@ -54,7 +54,7 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         )
         scenario = scenario.with_changes(bus=bus or f"unix:replay-{time.monotonic_ns():x}")
         return LoopOrder(scenario, paced=paced, reference=reference), True
-    if is_own(path):
+    if path.suffix.lower() == ".dhil" or is_own(path):
         reader = RecordingReader.open(path)
         reader.close()
         scenario = load(scenario_file) if scenario_file else _recorded_scenario(path, reader.header)
