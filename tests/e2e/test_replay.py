@@ -184,11 +184,12 @@ def test_damaged_header_is_refused(recorded: tuple[Path, dict[str, Any]], tmp_pa
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("x.dhil", b"something else", "unknown kind; there is: our own recordings, .ulg, candump .log, .blf, .asc"),
+        ("x.bin", b"something else", "unknown kind; there is: our own recordings, .ulg, candump .log, .blf, .asc"),
+        ("x.dhil", b"something else", "not a recording of ours at offset 0"),
         ("x.ulg", b"something else", "not a readable ULog"),
         ("x.log", b"something else\n", "no frames in it"),
         ("x.blf", b"something else", "no frames in it"),
-        ("x.dhil", b"", "unknown kind"),
+        ("x.dhil", b"", "not a recording of ours at offset 0"),
     ],
 )
 def test_foreign_file_is_a_wrong_request(tmp_path: Path, name: str, content: bytes, says: str) -> None:
