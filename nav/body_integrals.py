@@ -78,26 +78,27 @@ def change_by_turn(
 
 
 @kernel
-def _fit_weights(memory: FloatArray, m: int) -> None:
-    """Weights (m, m) that take the last m increments to the polynomial coefficients of the integrand over the last step.
+def _fit_weights(steps: FloatArray, place: int, weights: FloatArray) -> None:
+    """Weights (m, m) that take m increments to the coefficients of their polynomial over the step number `place`.
 
-    The integrand is sum_j a_j s^j, s from 0 to 1 over the last step, per unit of s; a_j = sum_i weight[j, i] increment_i,
+    The integrand is sum_j a_j s^j, s from 0 to 1 over that step, per unit of s; a_j = sum_i weights[j, i] increment_i,
     oldest first.
     """
+    m = len(steps)
     table = np.zeros((m, 2 * m))
-    last = memory[_WINDOW + 7 * (MAX_WINDOW - 1)]
-    right = 1.0
-    for i in range(m - 1, -1, -1):
-        h = memory[_WINDOW + 7 * (MAX_WINDOW - m + i)] / last
-        left = right - h
+    left = 0.0
+    for i in range(place):
+        left -= steps[i] / steps[place]
+    for i in range(m):
+        right = left + steps[i] / steps[place]
         p, q = left, right
         for j in range(m):
             table[i, j] = (q - p) / (j + 1.0)
             p *= left
             q *= right
         table[i, m + i] = 1.0
-        right = left
-    for k in range(m):  # Gauss-Jordan with column pivoting
+        left = right
+    for k in range(m):  # Gauss-Jordan with row pivoting
         pivot = k
         for i in range(k + 1, m):
             if abs(table[i, k]) > abs(table[pivot, k]):
@@ -114,8 +115,74 @@ def _fit_weights(memory: FloatArray, m: int) -> None:
                     table[i, j] -= factor * table[k, j]
     for j in range(m):
         for i in range(m):
-            memory[_WEIGHTS + j * MAX_WINDOW + i] = table[j, m + i]
-    memory[_READY] = m
+            weights[j, i] = table[j, m + i]
+
+
+@inline_kernel
+def _integrate_polynomial(
+    coefficient: FloatArray, m: int, t: float, k: int, dq: FloatArray, dv: FloatArray, ds: FloatArray
+) -> None:
+    """Integrals of one step of `t` s from the polynomials of rate and force over it, into row `k`."""
+    # Rate and force at the nodes; the angle up to each node.
+    a1x = a1y = a1z = a2x = a2y = a2z = a3x = a3y = a3z = 0.0
+    dvx = dvy = dvz = dsx = dsy = dsz = 0.0
+    for node in range(3):
+        s = _NODE[node]
+        wx = wy = wz = fx = fy = fz = gx = gy = gz = 0.0
+        for j in range(m - 1, -1, -1):
+            wx, wy, wz = wx * s + coefficient[j, 0], wy * s + coefficient[j, 1], wz * s + coefficient[j, 2]
+            fx, fy, fz = fx * s + coefficient[j, 3], fy * s + coefficient[j, 4], fz * s + coefficient[j, 5]
+            g = 1.0 / (j + 1.0)
+            gx, gy, gz = gx * s + g * coefficient[j, 0], gy * s + g * coefficient[j, 1], gz * s + g * coefficient[j, 2]
+        # Angle to the node: alpha + (1/2) int alpha x w, the latter by the polynomial's first three coefficients.
+        hx, hy, hz = s * gx, s * gy, s * gz
+        if m > 1:
+            kx, ky, kz = cross(
+                coefficient[0, 0], coefficient[0, 1], coefficient[0, 2],
+                coefficient[1, 0], coefficient[1, 1], coefficient[1, 2],
+            )
+            g = s * s * s / 12.0
+            hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
+        if m > 2:
+            kx, ky, kz = cross(
+                coefficient[0, 0], coefficient[0, 1], coefficient[0, 2],
+                coefficient[2, 0], coefficient[2, 1], coefficient[2, 2],
+            )
+            g = s * s * s * s / 12.0
+            hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
+        px, py, pz = change_by_turn(hx, hy, hz, fx, fy, fz)
+        px, py, pz = px + fx, py + fy, pz + fz
+        mass = _MASS[node]
+        dvx, dvy, dvz = dvx + mass * px, dvy + mass * py, dvz + mass * pz
+        mass *= 1.0 - s
+        dsx, dsy, dsz = dsx + mass * px, dsy + mass * py, dsz + mass * pz
+        if node == 0:
+            a2x, a2y, a2z = -wx, -wy, -wz
+            a3x, a3y, a3z = wx, wy, wz
+        elif node == 1:
+            a1x, a1y, a1z = wx, wy, wz
+            a3x, a3y, a3z = a3x - 2.0 * wx, a3y - 2.0 * wy, a3z - 2.0 * wz
+        else:
+            a2x, a2y, a2z = a2x + wx, a2y + wy, a2z + wz
+            a3x, a3y, a3z = a3x + wx, a3y + wy, a3z + wz
+    g = _ROOT15 / 3.0
+    a2x, a2y, a2z = g * a2x, g * a2y, g * a2z
+    g = 10.0 / 3.0
+    a3x, a3y, a3z = g * a3x, g * a3y, g * a3z
+    # Sixth-order Magnus; the body turns on the right, so each commutator has the other sign.
+    c1x, c1y, c1z = cross(a2x, a2y, a2z, a1x, a1y, a1z)
+    c2x, c2y, c2z = cross(a1x, a1y, a1z, 2.0 * a3x + c1x, 2.0 * a3y + c1y, 2.0 * a3z + c1z)
+    g = 1.0 / 60.0
+    kx, ky, kz = cross(
+        a2x + g * c2x, a2y + g * c2y, a2z + g * c2z,
+        c1x - 20.0 * a1x - a3x, c1y - 20.0 * a1y - a3y, c1z - 20.0 * a1z - a3z,
+    )
+    g = 1.0 / 240.0
+    dq[k, 0], dq[k, 1], dq[k, 2], dq[k, 3] = turn_of(
+        a1x + a3x / 12.0 + g * kx, a1y + a3y / 12.0 + g * ky, a1z + a3z / 12.0 + g * kz
+    )
+    dv[k, 0], dv[k, 1], dv[k, 2] = dvx, dvy, dvz
+    ds[k, 0], ds[k, 1], ds[k, 2] = t * dsx, t * dsy, t * dsz
 
 
 @kernel
@@ -150,6 +217,7 @@ def integrate_body(
         Out: velocity and position integrals in the body axes at the step's start, m/s and m.
     """
     coefficient = np.zeros((MAX_WINDOW, 6))
+    steps, weights = np.empty(MAX_WINDOW), np.empty((MAX_WINDOW, MAX_WINDOW))
     bx, by, bz = gyro_bias[0], gyro_bias[1], gyro_bias[2]
     top = _WINDOW + 7 * (MAX_WINDOW - 1)
     for k in range(step.shape[0]):
@@ -200,7 +268,13 @@ def integrate_body(
         memory[top + 1], memory[top + 2], memory[top + 3] = x, y, z
         memory[top + 4], memory[top + 5], memory[top + 6] = u, v, w
         if changed:
-            _fit_weights(memory, m)
+            for i in range(m):
+                steps[i] = memory[_WINDOW + 7 * (MAX_WINDOW - m + i)]
+            _fit_weights(steps[:m], m - 1, weights)
+            for j in range(m):
+                for i in range(m):
+                    memory[_WEIGHTS + j * MAX_WINDOW + i] = weights[j, i]
+            memory[_READY] = m
         for j in range(m):
             c0 = c1 = c2 = c3 = c4 = c5 = 0.0
             for i in range(m):
@@ -215,63 +289,53 @@ def integrate_body(
             coefficient[j, 0], coefficient[j, 1], coefficient[j, 2] = c0, c1, c2
             coefficient[j, 3], coefficient[j, 4], coefficient[j, 5] = c3, c4, c5
 
-        # Rate and force at the nodes; the angle up to each node.
-        a1x = a1y = a1z = a2x = a2y = a2z = a3x = a3y = a3z = 0.0
-        dvx = dvy = dvz = dsx = dsy = dsz = 0.0
-        for node in range(3):
-            s = _NODE[node]
-            wx = wy = wz = fx = fy = fz = gx = gy = gz = 0.0
-            for j in range(m - 1, -1, -1):
-                wx, wy, wz = wx * s + coefficient[j, 0], wy * s + coefficient[j, 1], wz * s + coefficient[j, 2]
-                fx, fy, fz = fx * s + coefficient[j, 3], fy * s + coefficient[j, 4], fz * s + coefficient[j, 5]
-                g = 1.0 / (j + 1.0)
-                gx, gy, gz = gx * s + g * coefficient[j, 0], gy * s + g * coefficient[j, 1], gz * s + g * coefficient[j, 2]
-            # Angle to the node: alpha + (1/2) int alpha x w, the latter by the polynomial's first three coefficients.
-            hx, hy, hz = s * gx, s * gy, s * gz
-            if m > 1:
-                kx, ky, kz = cross(
-                    coefficient[0, 0], coefficient[0, 1], coefficient[0, 2],
-                    coefficient[1, 0], coefficient[1, 1], coefficient[1, 2],
-                )
-                g = s * s * s / 12.0
-                hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
-            if m > 2:
-                kx, ky, kz = cross(
-                    coefficient[0, 0], coefficient[0, 1], coefficient[0, 2],
-                    coefficient[2, 0], coefficient[2, 1], coefficient[2, 2],
-                )
-                g = s * s * s * s / 12.0
-                hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
-            px, py, pz = change_by_turn(hx, hy, hz, fx, fy, fz)
-            px, py, pz = px + fx, py + fy, pz + fz
-            mass = _MASS[node]
-            dvx, dvy, dvz = dvx + mass * px, dvy + mass * py, dvz + mass * pz
-            mass *= 1.0 - s
-            dsx, dsy, dsz = dsx + mass * px, dsy + mass * py, dsz + mass * pz
-            if node == 0:
-                a2x, a2y, a2z = -wx, -wy, -wz
-                a3x, a3y, a3z = wx, wy, wz
-            elif node == 1:
-                a1x, a1y, a1z = wx, wy, wz
-                a3x, a3y, a3z = a3x - 2.0 * wx, a3y - 2.0 * wy, a3z - 2.0 * wz
-            else:
-                a2x, a2y, a2z = a2x + wx, a2y + wy, a2z + wz
-                a3x, a3y, a3z = a3x + wx, a3y + wy, a3z + wz
-        g = _ROOT15 / 3.0
-        a2x, a2y, a2z = g * a2x, g * a2y, g * a2z
-        g = 10.0 / 3.0
-        a3x, a3y, a3z = g * a3x, g * a3y, g * a3z
-        # Sixth-order Magnus; the body turns on the right, so each commutator has the other sign.
-        c1x, c1y, c1z = cross(a2x, a2y, a2z, a1x, a1y, a1z)
-        c2x, c2y, c2z = cross(a1x, a1y, a1z, 2.0 * a3x + c1x, 2.0 * a3y + c1y, 2.0 * a3z + c1z)
-        g = 1.0 / 60.0
-        kx, ky, kz = cross(
-            a2x + g * c2x, a2y + g * c2y, a2z + g * c2z,
-            c1x - 20.0 * a1x - a3x, c1y - 20.0 * a1y - a3y, c1z - 20.0 * a1z - a3z,
-        )
-        g = 1.0 / 240.0
-        dq[k, 0], dq[k, 1], dq[k, 2], dq[k, 3] = turn_of(
-            a1x + a3x / 12.0 + g * kx, a1y + a3y / 12.0 + g * ky, a1z + a3z / 12.0 + g * kz
-        )
-        dv[k, 0], dv[k, 1], dv[k, 2] = dvx, dvy, dvz
-        ds[k, 0], ds[k, 1], ds[k, 2] = t * dsx, t * dsy, t * dsz
+        _integrate_polynomial(coefficient, m, t, k, dq, dv, ds)
+
+
+@kernel
+def integrate_blocks(
+    window: int,
+    step: FloatArray,
+    dtheta: FloatArray,
+    dvel: FloatArray,
+    gyro_bias: FloatArray,
+    dq: FloatArray,
+    dv: FloatArray,
+    ds: FloatArray,
+) -> None:
+    """Integrals of a whole record, block by block: one polynomial for the `window` samples of each block.
+
+    More exact than the stream, because the polynomial reaches to both sides; for logs, and for real time that can wait for
+    a block. The last block reaches back where samples are missing. Parameters as in `integrate_body`; steps must be
+    positive and there must be `window` of them (else the polynomial has the degree that there is).
+    """
+    n = step.shape[0]
+    m = min(window, n)
+    coefficient = np.zeros((MAX_WINDOW, 6))
+    weights = np.empty((MAX_WINDOW, MAX_WINDOW, MAX_WINDOW))
+    fitted = np.zeros(MAX_WINDOW)
+    for block in range(0, n, m):
+        first = min(block, n - m)
+        changed = False
+        for i in range(m):
+            changed = changed or fitted[i] != step[first + i]
+            fitted[i] = step[first + i]
+        if changed:
+            for place in range(m):
+                _fit_weights(fitted[:m], place, weights[place])
+        for k in range(block, min(block + m, n)):
+            place = k - first
+            for j in range(m):
+                c0 = c1 = c2 = c3 = c4 = c5 = 0.0
+                for i in range(m):
+                    weight = weights[place, j, i]
+                    row = first + i
+                    c0 += weight * (dtheta[row, 0] - gyro_bias[0] * step[row])
+                    c1 += weight * (dtheta[row, 1] - gyro_bias[1] * step[row])
+                    c2 += weight * (dtheta[row, 2] - gyro_bias[2] * step[row])
+                    c3 += weight * dvel[row, 0]
+                    c4 += weight * dvel[row, 1]
+                    c5 += weight * dvel[row, 2]
+                coefficient[j, 0], coefficient[j, 1], coefficient[j, 2] = c0, c1, c2
+                coefficient[j, 3], coefficient[j, 4], coefficient[j, 5] = c3, c4, c5
+            _integrate_polynomial(coefficient, m, step[k], k, dq, dv, ds)
