@@ -6,11 +6,11 @@
 | `picard3` | increments, the previous one | 1 | 3 | 3 |
 | `picard3-source` | as `picard3`, with the source's scaling | 1 | 3 | 2 |
 | `four-sample`, `four-sample-series` | increments | 4 | 4 | 2 |
-| `coning:N`, N = 1..5 | increments | N | 2, 4, 3, 3, 3 | 2, 4, 2, 2, 2 |
-| `coning-uncompressed:N`, N = 1..5 | increments | N | 2, 4, 4, 4, 4 | 2, 4, 2, 2, 2 |
+| `coning:N`, N = 1..5 | increments | N | 2, 4, 3, 3, 3 | 2, 3, 2, 2, 2 |
+| `coning-uncompressed:N`, N = 1..5 | increments | N | 2, 4, 4, 4, 4 | 2, 3, 2, 2, 2 |
 | `coning-stream:N`, N = 1..5 | increments, N - 1 previous ones | 1 | 2, 3, 3, 3, 3 | 2, 3, 2, 2, 2 |
-| `high-order:N`, N = 1..10 (4) | increments | N | N + 1, N even: N + 2 | the same |
-| `high-order-stream:N`, N = 1..10 (4) | increments, N - 1 previous ones | 1 | N + 1 | the same |
+| `high-order:N`, N = 1..10 (4) | increments | N | N + 1, N even: N + 2 | N + 1 |
+| `high-order-stream:N`, N = 1..10 (4) | increments, N - 1 previous ones | 1 | N + 1 | N + 1 |
 
 `two-sample` is another name of `coning-stream:2`. The order is that of the largest attitude error in the step, under
 any smooth motion and over a fixed time; the coning family's error on pure coning falls much faster. Each method's

@@ -94,17 +94,28 @@ def _fitted_steps(
 
 
 @inline_kernel
-def _turn(kind: int, dtheta: FloatArray, step: FloatArray, begin: int, end: int, table: FloatArray) -> Quaternion:
-    """Rotation over the block that ends the window, by the methods with a formula for it."""
+def _turn(
+    kind: int,
+    dtheta: FloatArray,
+    step: FloatArray,
+    begin: int,
+    end: int,
+    table: FloatArray,
+    rows: FloatArray,
+    last: int,
+) -> None:
+    """Rotation over the block that ends the window, by the methods with a formula for it, into ``rows[last]``."""
     if kind in (PICARD3, PICARD3_SOURCE):
-        return picard3_turn(dtheta, step, end, kind == PICARD3_SOURCE)
-    if kind in (FOUR_SAMPLE, FOUR_SAMPLE_SERIES):
-        return four_sample_turn(dtheta, begin, kind == FOUR_SAMPLE_SERIES)
-    if kind == CONING:
-        return coning_turn(dtheta, step, begin, end, table)
-    if kind == CONING_UNCOMPRESSED:
-        return coning_uncompressed_turn(dtheta, step, begin, end, table)
-    return coning_stream_turn(dtheta, step, begin, end, table)
+        w, x, y, z = picard3_turn(dtheta, step, end, kind == PICARD3_SOURCE)
+    elif kind in (FOUR_SAMPLE, FOUR_SAMPLE_SERIES):
+        w, x, y, z = four_sample_turn(dtheta, begin, kind == FOUR_SAMPLE_SERIES)
+    elif kind == CONING:
+        w, x, y, z = coning_turn(dtheta, step, begin, end, table)
+    elif kind == CONING_UNCOMPRESSED:
+        w, x, y, z = coning_uncompressed_turn(dtheta, step, begin, end, table)
+    else:
+        w, x, y, z = coning_stream_turn(dtheta, step, begin, end, table)
+    rows[last, 0], rows[last, 1], rows[last, 2], rows[last, 3] = w, x, y, z
 
 
 @kernel
@@ -148,6 +159,7 @@ def advance(
     rows = state[_ROWS:_WORK].reshape((MAX_SAMPLES, 4))
     work = state[_WORK:STATE]
     q = state[_ATTITUDE : _ATTITUDE + 4]
+    attitude = q.reshape((1, 4))
     vector, matrix = state[_EXTRA : _EXTRA + 3], state[_EXTRA : _EXTRA + 9].reshape((3, 3))
     rates = state[_RATES : _RATES + 9].reshape((3, 3))
     runge_kutta = kind in (POISSON, EULER_VECTOR)
@@ -169,22 +181,17 @@ def advance(
                 if not by_formula or (mode == EVERY_ROW and last > 0):
                     turns(angles, steps, begin, filled, filled - since, mode == EVERY_ROW, work, rows)
                 if by_formula:
-                    rows[last, 0], rows[last, 1], rows[last, 2], rows[last, 3] = _turn(
-                        kind, angles, steps, begin, filled, table
-                    )
-                for i in range(0 if mode == EVERY_ROW else last, since):
-                    _compose(q, rows, i)
+                    _turn(kind, angles, steps, begin, filled, table, rows, last)
+                _compose(q, rows, 0 if mode == EVERY_ROW else last, since)
             if mode == EVERY_ROW:
                 _write_back(rows, step, k, since, out)
             elif mode == STREAM or whole:
                 _copy(rows, last, out, k if mode == STREAM else ends)
             if whole:
-                for c in range(4):
-                    q[c] = rows[last, c]
+                _copy(rows, last, attitude, 0)
                 ends, since, size = ends + 1, 0, block
         elif since == 0 and mode != BLOCK_ENDS:
-            for c in range(4):
-                out[k, c] = q[c]
+            _copy(attitude, 0, out, k)
     state[_FILLED], state[_SINCE] = filled, since
     if size == block and ends > 0:
         state[_STARTED] = 1.0
@@ -215,15 +222,16 @@ def _copy(rows: FloatArray, i: int, out: FloatArray, k: int) -> None:
 
 
 @inline_kernel
-def _compose(q: FloatArray, rows: FloatArray, i: int) -> None:
-    """rows[i] = q rows[i], to unit norm."""
-    a, b, c, d = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
-    w = q[0] * a - q[1] * b - q[2] * c - q[3] * d
-    x = q[0] * b + q[1] * a + q[2] * d - q[3] * c
-    y = q[0] * c - q[1] * d + q[2] * a + q[3] * b
-    z = q[0] * d + q[1] * c - q[2] * b + q[3] * a
-    s = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = s * w, s * x, s * y, s * z
+def _compose(q: FloatArray, rows: FloatArray, first: int, end: int) -> None:
+    """rows[i] = q rows[i], to unit norm, for i from `first` to `end` - 1."""
+    for i in range(first, end):
+        a, b, c, d = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        w = q[0] * a - q[1] * b - q[2] * c - q[3] * d
+        x = q[0] * b + q[1] * a + q[2] * d - q[3] * c
+        y = q[0] * c - q[1] * d + q[2] * a + q[3] * b
+        z = q[0] * d + q[1] * c - q[2] * b + q[3] * a
+        s = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = s * w, s * x, s * y, s * z
 
 
 @inline_kernel

@@ -21,8 +21,9 @@ from nav.kernel import inline_kernel
 MAX_SAMPLES = 10
 """Most samples in a polynomial: beyond it, equally spaced samples amplify their noise more than they add order."""
 
-MAX_TERMS = 48
-"""Most terms of the series: enough for a span that turns by a whole revolution."""
+MAX_TERMS = 96
+"""Most terms of the series. Smooth motion takes ten to twenty; only a rate that the polynomial hardly resolves takes all,
+and then what is left out is below the error of the polynomial."""
 
 _NODES = 0
 _NEWTON = _NODES + MAX_SAMPLES + 1
