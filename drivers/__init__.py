@@ -3,7 +3,7 @@
 A board is one module with one class that satisfies `FrameDriver`, found by the entry-point group `dtg_hil.drivers`.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from typing import Protocol
 
@@ -14,7 +14,7 @@ from nav.increments import HeadIncrements, ImuIncrements, IntArray
 
 @dataclass(slots=True)
 class Counters:
-    """What became of the frames that came in. ``sent = samples + lost`` for the samples between the first and the last."""
+    """What became of the frames that came in. Samples sent from the first to the last are ``samples + lost + late``."""
 
     frames: int = 0
     """Frames of any kind."""
@@ -37,9 +37,13 @@ class Counters:
     restarts: int = 0
     """Times the board started anew."""
 
+    def as_list(self) -> list[int]:
+        """The counts in the order of the fields."""
+        return [getattr(self, name) for name in self.__slots__]
+
     def as_dict(self) -> dict[str, int]:
         """Name to count."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        return dict(zip(self.__slots__, self.as_list(), strict=True))
 
 
 class FrameDriver(Protocol):

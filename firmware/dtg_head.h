@@ -97,7 +97,7 @@ extern "C" {
 #define DTG_HEAD_IDENTITY_CYCLE_TIME_MS (1000u)
 #define DTG_HEAD_CONFIG_CYCLE_TIME_MS (1000u)
 #define DTG_HEAD_TEMPERATURE_CYCLE_TIME_MS (1000u)
-#define DTG_HEAD_ROTOR_CYCLE_TIME_MS (100u)
+#define DTG_HEAD_ROTOR_CYCLE_TIME_MS (1000u)
 #define DTG_HEAD_BIT_CYCLE_TIME_MS (1000u)
 
 /* Signal choices. */
@@ -356,7 +356,7 @@ struct dtg_head_sample_t {
 /**
  * Signals in message HEAD_C0.
  *
- * Classic CAN, frame 1 of the 6 of one sample (no rotor angles): counter and status. Sent in the order C0..C5. The counter counts to 15, where AUTOSAR stops at 14: it is part of the sample number.
+ * Classic CAN, frame 1 of the 6 of one sample (no rotor angles): counter and status. Sent in the order C0..C5. The counter is the same in all six frames of a sample.
  *
  * All signal values are as on the CAN bus.
  */
@@ -371,7 +371,7 @@ struct dtg_head_c0_t {
     uint8_t crc8;
 
     /**
-     * Low nibble of sample_counter: equal in the six frames of one sample.
+     * sample_counter modulo 15 (0..14, as Profile 11 asks): equal in the six frames of one sample.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1
@@ -401,7 +401,7 @@ struct dtg_head_c0_t {
 /**
  * Signals in message HEAD_C1.
  *
- * Classic CAN, frame 2 of the 6 of one sample (no rotor angles): time. Sent in the order C0..C5. The counter counts to 15, where AUTOSAR stops at 14: it is part of the sample number.
+ * Classic CAN, frame 2 of the 6 of one sample (no rotor angles): time. Sent in the order C0..C5. The counter is the same in all six frames of a sample.
  *
  * All signal values are as on the CAN bus.
  */
@@ -416,7 +416,7 @@ struct dtg_head_c1_t {
     uint8_t crc8;
 
     /**
-     * Low nibble of sample_counter: equal in the six frames of one sample.
+     * sample_counter modulo 15 (0..14, as Profile 11 asks): equal in the six frames of one sample.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1
@@ -455,7 +455,7 @@ struct dtg_head_c1_t {
 /**
  * Signals in message HEAD_C2.
  *
- * Classic CAN, frame 3 of the 6 of one sample (no rotor angles): G1 x. Sent in the order C0..C5. The counter counts to 15, where AUTOSAR stops at 14: it is part of the sample number.
+ * Classic CAN, frame 3 of the 6 of one sample (no rotor angles): G1 x. Sent in the order C0..C5. The counter is the same in all six frames of a sample.
  *
  * All signal values are as on the CAN bus.
  */
@@ -470,7 +470,7 @@ struct dtg_head_c2_t {
     uint8_t crc8;
 
     /**
-     * Low nibble of sample_counter: equal in the six frames of one sample.
+     * sample_counter modulo 15 (0..14, as Profile 11 asks): equal in the six frames of one sample.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1
@@ -500,7 +500,7 @@ struct dtg_head_c2_t {
 /**
  * Signals in message HEAD_C3.
  *
- * Classic CAN, frame 4 of the 6 of one sample (no rotor angles): G1 y. Sent in the order C0..C5. The counter counts to 15, where AUTOSAR stops at 14: it is part of the sample number.
+ * Classic CAN, frame 4 of the 6 of one sample (no rotor angles): G1 y. Sent in the order C0..C5. The counter is the same in all six frames of a sample.
  *
  * All signal values are as on the CAN bus.
  */
@@ -515,7 +515,7 @@ struct dtg_head_c3_t {
     uint8_t crc8;
 
     /**
-     * Low nibble of sample_counter: equal in the six frames of one sample.
+     * sample_counter modulo 15 (0..14, as Profile 11 asks): equal in the six frames of one sample.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1
@@ -545,7 +545,7 @@ struct dtg_head_c3_t {
 /**
  * Signals in message HEAD_C4.
  *
- * Classic CAN, frame 5 of the 6 of one sample (no rotor angles): G2 y. Sent in the order C0..C5. The counter counts to 15, where AUTOSAR stops at 14: it is part of the sample number.
+ * Classic CAN, frame 5 of the 6 of one sample (no rotor angles): G2 y. Sent in the order C0..C5. The counter is the same in all six frames of a sample.
  *
  * All signal values are as on the CAN bus.
  */
@@ -560,7 +560,7 @@ struct dtg_head_c4_t {
     uint8_t crc8;
 
     /**
-     * Low nibble of sample_counter: equal in the six frames of one sample.
+     * sample_counter modulo 15 (0..14, as Profile 11 asks): equal in the six frames of one sample.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1
@@ -590,7 +590,7 @@ struct dtg_head_c4_t {
 /**
  * Signals in message HEAD_C5.
  *
- * Classic CAN, frame 6 of the 6 of one sample (no rotor angles): G2 z. Sent in the order C0..C5. The counter counts to 15, where AUTOSAR stops at 14: it is part of the sample number.
+ * Classic CAN, frame 6 of the 6 of one sample (no rotor angles): G2 z. Sent in the order C0..C5. The counter is the same in all six frames of a sample.
  *
  * All signal values are as on the CAN bus.
  */
@@ -605,7 +605,7 @@ struct dtg_head_c5_t {
     uint8_t crc8;
 
     /**
-     * Low nibble of sample_counter: equal in the six frames of one sample.
+     * sample_counter modulo 15 (0..14, as Profile 11 asks): equal in the six frames of one sample.
      *
      * Range: 0..15 (0..15 -)
      * Scale: 1

@@ -34,9 +34,8 @@ from hil.warmup import warm_loop
 from hil.world.truth import TruthKeeper
 from nav.errors import HilError
 from nav.gaps import GapPolicy
-from nav.increments import HeadIncrements, ImuIncrements
+from nav.increments import HeadIncrements, ImuIncrements, IntArray
 from nav.instruments.head import HeadCombiner
-from nav.lever_arm import shift
 from nav.navigator import Navigator, Settings
 from nav.rotation import dcm_from_quaternion, quaternion_from_euler
 from nav.state import HOST_FIELDS, NAV_STATE
@@ -47,7 +46,6 @@ TICK_S = 0.02
 """Longest wait for a frame."""
 EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
 """A message for the user, as it lies in the ring of events."""
-_COUNTED = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors", "restarts")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +110,8 @@ def settings_of(scenario: Scenario) -> Settings:
         position_trusted=navigation.alignment != "level",
         attitude=navigation.attitude,
         mechanization=navigation.mechanization,
+        gravity=navigation.gravity,
+        lever_arm=scenario.head.lever_arm_m,
         gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
     )
 
@@ -127,10 +127,10 @@ class Loop:
         self.finished = False
         """The scenario's duration is over."""
         head = scenario.head
-        self._arm = -np.asarray(head.lever_arm_m)
         self._combiner = HeadCombiner(dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))))
         self._outlets = outlets
         self._live = order.paced and order.file is None
+        self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
         self._truth: TruthKeeper | None = None
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
@@ -138,7 +138,9 @@ class Loop:
         self._keep_trace = order.keep_trace
         self._clock = ClockMap()
         self._restarts = 0
+        self._arrival_ns = 0
         self._started: float | None = None
+        self._covered = 0.0
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
@@ -157,22 +159,32 @@ class Loop:
         self._count()
         if len(raw) == 0:
             return False
-        if driver.counters.restarts != self._restarts:
+        arrivals, start = driver.arrivals(), 0
+        if driver.counters.restarts != self._restarts:  # its clock begins anew, maybe in the middle of the batch
             self._restarts = driver.counters.restarts
+            for stop in (np.flatnonzero(np.diff(raw.time) < 0.0) + 1).tolist():
+                self._pass(raw.rows(start, stop), arrivals[start:stop])
+                start, self._started = stop, None
             self._clock.reset()
             self._started = None
-        arrivals = driver.arrivals()
+        self._pass(raw.rows(start, len(raw)), arrivals[start:])
+        return True
+
+    def _pass(self, raw: HeadIncrements | ImuIncrements, arrivals: IntArray) -> None:
+        """Navigate samples of one life of the device."""
+        if self.finished:
+            return
         raw = self._cut(raw)
-        if self._truth is None and driver.world_id == self._world:
-            self._truth = TruthKeeper(self.scenario)
+        if len(raw) == 0:
+            return
+        if self._truth is None and self.driver.world_id == self._world:
+            self._truth = self._own_truth
         if self._from_truth and not self._begin(raw):
-            return True
+            return
         imu = self._combiner.combine(raw) if isinstance(raw, HeadIncrements) else raw
         rows = self.navigator.process(imu)
-        if self._arm.any():
-            position = rows["lat"], rows["lon"], rows["height"]
-            shift(*position, rows["vel_n"], rows["q_nb"], rows["w_ib_b"], self._arm)
         rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
+        self._arrival_ns = int(arrivals[-1])
         self._publish(rows)
         stats = self._outlets.stats
         if self._live:
@@ -180,19 +192,20 @@ class Loop:
             stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
         if len(rows) != len(imu):
             stats["interpolated"] += len(rows) - len(imu)
-        return True
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
-        """Up to the scenario's duration, counted from the first sample."""
+        """Up to the scenario's duration: the device time covered so far, all lives of the device together."""
         if self._started is None:
-            self._started = float(raw.time[0] - raw.step[0])
-            self._outlets.stats["started_us"] = round(self._started * 1e6)
+            self._started = float(raw.time[0] - raw.step[0]) - self._covered
         duration = self.scenario.duration_s
         if duration is not None:
             end = self._started + duration + 1e-9
             if raw.time[-1] >= end - raw.step[-1]:
                 self.finished = True
-                return raw.rows(0, int(np.searchsorted(raw.time, end, "right")))
+                raw = raw.rows(0, int(np.searchsorted(raw.time, end, "right")))
+        if len(raw):
+            self._covered = float(raw.time[-1]) - self._started
+            self._outlets.stats["covered_us"] = round(self._covered * 1e6)
         return raw
 
     def _begin(self, raw: HeadIncrements | ImuIncrements) -> bool:
@@ -205,19 +218,18 @@ class Loop:
                 )
             return False
         truth = self._truth.motion.truth(np.array([raw.time[0] - raw.step[0]]))
-        if self._arm.any():
-            position = truth["lat"], truth["lon"], truth["height"]
-            shift(*position, truth["vel_n"], truth["q_nb"], truth["w_ib_b"], -self._arm)
         row = truth[0]
-        start = float(raw.time[0] - raw.step[0])
-        self.navigator.begin(row["lat"], row["lon"], row["height"], row["vel_n"], row["q_nb"], start)
+        position = row["lat"], row["lon"], row["height"]
+        self.navigator.begin(*position, row["vel_n"], row["q_nb"], float(row["time"]), row["w_ib_b"])
         self._from_truth = False
         return True
 
     def obey(self, event: int) -> None:
         """Repeat an event: silence, or an ordered alignment."""
         if event == SILENCE:
-            self._publish(self.navigator.silent())
+            rows = self.navigator.silent()
+            rows["arrival_ns"] = self._arrival_ns
+            self._publish(rows)
             self._outlets.stats["silences"] += 1
         elif event == REALIGN:
             self.navigator.realign(self._last_time(), "ordered")
@@ -241,7 +253,11 @@ class Loop:
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
             note = np.zeros(1, EVENTS)
-            note["time"], note["severity"], note["text"] = event.time, event.severity.encode(), event.text.encode()[:240]
+            note["time"], note["severity"], note["text"] = (
+                event.time,
+                event.severity.encode(),
+                event.text.encode()[:240],
+            )
             outlets.events.push(note)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
@@ -251,9 +267,8 @@ class Loop:
             self._trace.add(rows)
 
     def _count(self) -> None:
-        stats, counters = self._outlets.stats, self.driver.counters
-        for name in _COUNTED:
-            stats[name] = getattr(counters, name)
+        counters = self.driver.counters
+        self._outlets.stats.set_block("frames", counters.as_list())
         self._outlets.control.set_loss(counters.lost, counters.samples)
 
     def result(self) -> dict[str, Any]:

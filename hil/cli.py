@@ -1,6 +1,7 @@
 """The command `hil`. Exit code 2 for a wrong request, 1 for a failed run, 0 otherwise; ``--json`` prints one object."""
 
 import json
+import os
 import signal
 import sys
 import time
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from hil.bridge import LoopOrder
     from hil.session import Session
 
+COMMON_BUS = "unix:dtg-hil"
+"""Where `hil imu` and `hil run --imu` meet when no bus is named."""
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
 
 
@@ -29,10 +33,13 @@ Duration = Annotated[float | None, typer.Option(min=0.0, help="Seconds of device
 Speed = Annotated[str, typer.Option(help="1: real time; max: simulated time, as fast as it goes.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the simulated errors.")]
 Links = Annotated[
-    list[str] | None, typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none.")
+    list[str] | None,
+    typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
-Asserts = Annotated[list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")]
+Asserts = Annotated[
+    list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
+]
 Junit = Annotated[Path | None, typer.Option(help="Write the assertions as JUnit XML.")]
 ScenarioName = Annotated[str | None, typer.Argument(help="TOML file or built-in name; left out: the embedded default.")]
 
@@ -49,18 +56,30 @@ def run(
     record: Record = None,
     assertion: Asserts = None,
     junit: Junit = None,
+    no_dashboard: Annotated[
+        bool, typer.Option("--no-dashboard", help="Serve no dashboard (this version has none).")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Run the bridge: IMU in, navigation, MAVLink out. Without --bus and --imu it brings its own simulated head."""
+    """Run the bridge: IMU in, navigation, MAVLink out. Without a bus it brings its own simulated head."""
     from hil.bridge import LoopOrder
     from hil.scenario import load
     from hil.session import simulated_head
 
-    chosen = load(scenario).with_changes(**_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink))
-    order = LoopOrder(chosen, paced=_paced(speed))
-    outside = bus is not None or imu is not None
-    if outside and not order.paced:
-        raise HilError("--speed max needs the simulated head of this process: leave --bus and --imu out")
+    del no_dashboard  # accepted, so that command lines stay valid
+
+    chosen = load(scenario).with_changes(
+        **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
+    )
+    outside = bool(chosen.bus) or imu is not None
+    if outside and not _paced(speed):
+        raise HilError(
+            "--speed max needs the simulated head of `hil run`: leave --bus, --imu and the scenario's bus out"
+        )
+    order = LoopOrder(
+        chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
+        paced=_paced(speed),
+    )
     _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
 
 
@@ -78,6 +97,7 @@ def imu(
     from hil.world.head import SimulatedHead, feed
 
     chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
+    chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
     stop = _StopSignal()
     head = SimulatedHead(chosen)
     _say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
@@ -113,7 +133,7 @@ def replay(
         check_plot(plot)
         order = replace(order, keep_trace=True)
     feeder = (run_player, (log, order.scenario, order.paced)) if over_bus else None
-    summary = _run(order, feeder, record, assertion, junit, as_json=as_json, quiet_exit=plot is not None)
+    summary = _run(order, feeder, record, assertion, junit, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -135,14 +155,12 @@ def navigate(
     """Navigate logged increments offline."""
     from hil.offline import IMU_HEADER, NAV_HEADER, read_start, read_table, thin, write_table
     from hil.offline import navigate as navigate_rows
-    from nav.mechanization import check_choice
+    from nav.strapdown import Strapdown
 
-    check_choice(attitude, mechanization)
-    if gravity != "normal":
-        raise HilError(f"unknown gravity {gravity!r}; there is: normal")
+    Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
     table, start = read_table(imu_file, IMU_HEADER), read_start(init)
     began = time.perf_counter()
-    rows = navigate_rows(table, start, attitude, mechanization)
+    rows = navigate_rows(table, start, attitude, mechanization, gravity)
     seconds = time.perf_counter() - began
     if every:
         rows = thin(rows, every)
@@ -174,14 +192,17 @@ def decode(
 def record(
     file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
     bus: Annotated[str, typer.Option(help="Bus URL.")],
+    scenario: Annotated[str | None, typer.Option(help="Scenario that a replay of this recording shall use.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds, then stop.")] = None,
     as_json: Json = False,
 ) -> None:
     """Record what is on the bus."""
     from hil.decoder import record_bus
+    from hil.scenario import load
 
     stop = _StopSignal()
-    _report(record_bus(bus, file, duration, lambda: stop.wanted), as_json=as_json)
+    chosen = load(scenario).with_changes(bus=bus)
+    _report(record_bus(chosen, file, duration, lambda: stop.wanted), as_json=as_json)
 
 
 @app.command()
@@ -200,9 +221,39 @@ def doctor(as_json: Json = False) -> None:
     colours = {"ok": "green", "lack": "yellow", "info": "cyan"}
     for finding in findings:
         table.add_row(
-            f"[{colours[finding.verdict]}]{finding.verdict}[/]", finding.what, finding.found, finding.mend, end_section=False
+            f"[{colours[finding.verdict]}]{finding.verdict}[/]",
+            finding.what,
+            finding.found,
+            finding.mend,
+            end_section=False,
         )
     Console(highlight=False).print(table)
+
+
+@app.command()
+def study(
+    names: Annotated[list[str], typer.Argument(help="Names of studies, or all.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the report (HTML, SVG, JSON).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Reproduce the published tables and figures beside our own; exit code 1 when a limit is not kept."""
+    from hil.study import study as run_study
+    from hil.study import study_names
+
+    failed = []
+    for name in study_names() if names == ["all"] else names:
+        rows = run_study(name, out)
+        failed += [f"{name}: {row['id']}" for row in rows if not row["ok"]]
+        if as_json:
+            print(json.dumps({"study": name, "rows": rows}))
+            continue
+        for row in rows:
+            mark = "  " if row["ok"] else "! "
+            print(
+                f"{mark}{row['id']:34} published {row['published']!s:>10}  ours {row['ours']!s:>24} {row['unit']}  {row['what']}"
+            )
+    if failed:
+        raise RunFailed("not within its limit: " + ", ".join(failed))
 
 
 @app.command()
@@ -215,7 +266,11 @@ def bench(as_json: Json = False) -> None:
         print(json.dumps({"rows": rows}))
         return
     for row in rows:
-        ratio = "" if row["peer_ns"] is None else f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        ratio = (
+            ""
+            if row["peer_ns"] is None
+            else f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        )
         print(f"{row['id']:24} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
@@ -235,7 +290,6 @@ def _run(
     junit: Path | None,
     *,
     as_json: bool,
-    quiet_exit: bool = False,
 ) -> dict[str, Any]:
     """Run a session to its end, show it, check the assertions; the summary."""
     from hil.assertions import parse, write_junit
@@ -254,6 +308,8 @@ def _run(
         try:
             _follow(session, stop, view)
         except HilError as error:
+            if session.outlets.stats["samples"] == 0:  # nothing was ever navigated: the request was wrong
+                raise
             raise RunFailed(str(error)) from error
     view.show_events()
     summary = session.summary()
@@ -326,5 +382,3 @@ def main() -> None:
         for line in str(error).splitlines():
             _say(f"hil: {line}")
         raise SystemExit(1 if isinstance(error, RunFailed) else 2) from None
-
-

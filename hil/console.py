@@ -49,7 +49,9 @@ class RunView:
         if self._terminal:
             filled = round(20 * done / total)
             bar = "#" * filled + "." * (20 - filled)
-            self._live.update(Text(f"preparing the kernels (the first run compiles them) [{bar}] {done}/{total}"), refresh=True)
+            self._live.update(
+                Text(f"preparing the kernels (the first run compiles them) [{bar}] {done}/{total}"), refresh=True
+            )
         elif not self._said_compiling:
             self._said_compiling = True
             self._console.print("preparing the kernels (the first run compiles them, up to a minute)")
@@ -76,7 +78,12 @@ class RunView:
         rate = (samples - self._last_samples) / (now_s - self._last_s) if self._last_s else 0.0
         self._last_samples, self._last_s = samples, now_s
         mode, health = Mode(int(state["mode"])), Health(int(state["health"]))
-        parts = [f"{state['time']:8.1f} s", f"{rate:6.0f} Hz", f"age {stats['age_us'] / 1000:.2f} ms", f"lost {stats['lost']}"]
+        parts = [
+            f"{state['time']:8.1f} s",
+            f"{rate:6.0f} Hz",
+            f"age {stats['age_us'] / 1000:.2f} ms",
+            f"lost {stats['lost']}",
+        ]
         if mode == Mode.ALIGN:
             parts.append(f"ALIGN {100 * float(state['progress']):.0f} %")
         else:
@@ -107,10 +114,15 @@ def print_summary(summary: dict[str, Any]) -> None:
             "bad check, foreign, short, other version",
             f"{summary['crc_errors']}, {summary['foreign']}, {summary['short']}, {summary['version_errors']}",
         ),
-        ("head restarts, steps made up, silences", f"{summary['restarts']}, {summary['interpolated']}, {summary['silences']}"),
+        (
+            "head restarts, steps made up, silences",
+            f"{summary['restarts']}, {summary['interpolated']}, {summary['silences']}",
+        ),
         (
             "latency, frame to solution",
-            f"p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, max {latency['max']:.0f} us" if latency["max"] else "-",
+            f"p50 {latency['p50']:.0f} us, p99 {latency['p99']:.0f} us, max {latency['max']:.0f} us"
+            if latency["max"]
+            else "-",
         ),
         ("MAVLink messages sent", str(sum(summary["mavlink_sent"].values()))),
     ):

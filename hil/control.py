@@ -4,6 +4,12 @@ Orders (stop, go, align) come from the session and the publisher, the loss of sa
 frames from the recorder.
 """
 
+import multiprocessing as mp
+import os
+import time
+from collections.abc import Callable
+from multiprocessing.connection import wait
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -11,6 +17,9 @@ import numpy as np
 from hil.ring import Shared
 
 _STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _FIELDS = range(7)
+
+ORPHAN_S = 10.0
+"""Longest time for a process to end on its own when the one that started it is gone."""
 
 
 class Control:
@@ -72,3 +81,28 @@ class Control:
     @recorded.setter
     def recorded(self, count: int) -> None:
         self._values[_RECORDED] = count
+
+
+def run_part(control: Control, nice: int, target: Callable[..., None], *args: Any) -> None:
+    """Target of every process of a run: calls ``target(*args)``, and has it stopped when the session is gone.
+
+    `nice` is how far it steps back behind the loop and the sensor where processors are few.
+
+    A session that is killed cannot order anything: without this a simulated head would go on sending for ever.
+    """
+    os.nice(nice)
+    parent = mp.parent_process()
+    if parent is not None:
+        Thread(target=_outlive, args=(control, parent.sentinel), daemon=True).start()
+    try:
+        target(*args)
+    except BrokenPipeError:
+        if parent is None or parent.is_alive():
+            raise
+
+
+def _outlive(control: Control, sentinel: int) -> None:
+    wait([sentinel])
+    control.order_stop()
+    time.sleep(ORPHAN_S)
+    os._exit(1)

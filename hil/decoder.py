@@ -1,6 +1,7 @@
 """Frames without navigation: decoding a file to JSON lines, recording a bus."""
 
 import json
+import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ from drivers.can.bus import open_port
 from drivers.can.convert import to_message
 from drivers.can.frames import frames
 from drivers.logs.recording import EVENT, RecordingWriter
+from hil.scenario import Scenario
 from hil.source import FileSource
 from nav.errors import HilError
 
@@ -30,7 +32,10 @@ def decode_file(driver_name: str, path: Path) -> tuple[Iterator[str], Callable[[
             good = batch[:n][batch["reserved"][:n, 0] != EVENT]
             samples = driver.decode(good)
             for k in range(len(samples)):
-                yield json.dumps({name: _plain(getattr(samples, name)[k]) for name in _FIELDS if hasattr(samples, name)}) + "\n"
+                yield (
+                    json.dumps({name: _plain(getattr(samples, name)[k]) for name in _FIELDS if hasattr(samples, name)})
+                    + "\n"
+                )
 
     return lines(), driver.counters.as_dict, source.problem
 
@@ -39,17 +44,19 @@ def _plain(value: Any) -> Any:
     """A JSON value; NaN (not on this wire) is null."""
     listed = value.tolist()
     if isinstance(listed, list):
-        return [None if item != item else item for item in listed]
+        return [None if math.isnan(item) else item for item in listed]
     return listed
 
 
-def record_bus(url: str, path: Path, duration_s: float | None, cancelled: Callable[[], bool]) -> dict[str, Any]:
-    """Record frames of the bus until cancelled; what was recorded."""
-    port = open_port(url)
+def record_bus(
+    scenario: Scenario, path: Path, duration_s: float | None, cancelled: Callable[[], bool]
+) -> dict[str, Any]:
+    """Record frames of the scenario's bus until cancelled; what was recorded."""
+    port = open_port(scenario.bus)
     batch = frames(1024)
     count, began = 0, time.monotonic()
     try:
-        with _writer(path, url) as write:
+        with _writer(path, scenario) as write:
             while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
                 n = port.receive(batch, 0.05)
                 write(batch[:n])
@@ -62,13 +69,11 @@ def record_bus(url: str, path: Path, duration_s: float | None, cancelled: Callab
 class _writer:
     """Our recording by the ending .dhil, python-can's writers by any other."""
 
-    def __init__(self, path: Path, url: str) -> None:
+    def __init__(self, path: Path, scenario: Scenario) -> None:
         self._own: RecordingWriter | None = None
         if path.suffix == ".dhil":
-            from hil.scenario import load
-
-            scenario = load(None).with_changes(bus=url).model_dump(mode="json")
-            self._own = RecordingWriter(path, {"scenario": scenario, "created_ns": time.time_ns()})
+            header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
+            self._own = RecordingWriter(path, header)
             return
         try:
             self._foreign: Any = can.Logger(path)

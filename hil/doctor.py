@@ -67,7 +67,9 @@ def _can() -> Iterator[Finding]:
         "SocketCAN",
         "ok" if kernel else "lack",
         "the kernel has it" if kernel else "this kernel has no AF_CAN",
-        "" if kernel else "sudo modprobe can_raw; without it use unix: or udp_multicast:, or user-mode Linux (make vcan)",
+        ""
+        if kernel
+        else "sudo modprobe can_raw; without it use unix: or udp_multicast:, or user-mode Linux (make vcan)",
     )
     interfaces = can_interfaces()
     yield Finding(

@@ -1,17 +1,17 @@
-"""`hil navigate`: strapdown navigation of logged increments, from file to file, as `guide` in docs/cli.md lays out."""
+"""`hil navigate`: strapdown navigation of logged increments, from file to file, as docs/cli.md lays out."""
 
 import math
 import tomllib
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nav.errors import HilError
-from nav.increments import FloatArray, ImuIncrements
-from nav.navigator import Navigator, Settings
+from nav.increments import FloatArray
 from nav.rotation import euler_angles, quaternion_from_euler
+from nav.strapdown import Strapdown
 
 IMU_HEADER = ("time_s", "dtheta_x", "dtheta_y", "dtheta_z", "dvel_x", "dvel_y", "dvel_z")
 NAV_HEADER = (
@@ -42,6 +42,8 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(header)}") from error
+    except (ValueError, EOFError, BadZipFile) as error:  # not text, no archive, columns of unequal length
+        raise HilError(f"{path}: {error}") from error
     if len(table) == 0:
         raise HilError(f"{path}: no rows")
     bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
@@ -51,17 +53,32 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
 
 
 def _read_csv(path: Path, header: tuple[str, ...]) -> FloatArray:
-    with path.open() as file:
+    with path.open(encoding="utf-8") as file:
         first = tuple(name.strip() for name in file.readline().split(","))
         if first != header:
             raise HilError(f"{path}: line 1: the header is {','.join(first)!r}, expected {','.join(header)!r}")
         try:
-            table: FloatArray = np.loadtxt(file, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise HilError(f"{path}: {error} (rows are counted after the header)") from error
+            table: FloatArray = np.loadtxt(file, delimiter=",", ndmin=2, comments=None)
+        except ValueError:
+            raise HilError(f"{path}: {_first_bad_line(path, len(header))}") from None
     if table.size and table.shape[1] != len(header):
-        raise HilError(f"{path}: {table.shape[1]} columns, expected {len(header)}")
+        raise HilError(f"{path}: line 2: {table.shape[1]} columns, expected {len(header)}")
     return table.reshape(-1, len(header))
+
+
+def _first_bad_line(path: Path, columns: int) -> str:
+    with path.open(encoding="utf-8") as file:
+        next(file)
+        for number, line in enumerate(file, start=2):
+            values = line.split(",")
+            if line.strip() and len(values) != columns:
+                return f"line {number}: {len(values)} columns, expected {columns}"
+            for value in values:
+                try:
+                    float(value) if line.strip() else None
+                except ValueError:
+                    return f"line {number}: {value.strip()!r} is not a number"
+    return "it cannot be read as numbers"
 
 
 def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
@@ -76,9 +93,10 @@ def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
         if path.suffix.lower() == ".npz":
             np.savez(path, **{name: table[:, i] for i, name in enumerate(header)})  # type: ignore[arg-type]
         elif path.suffix.lower() == ".parquet":
+            parquet = _parquet()
             import pyarrow as pa
 
-            _parquet().write_table(pa.table({name: table[:, i] for i, name in enumerate(header)}), path)
+            parquet.write_table(pa.table({name: table[:, i] for i, name in enumerate(header)}), path)
         else:
             np.savetxt(path, table, fmt="%.17g", delimiter=",", header=",".join(header), comments="")
     except OSError as error:
@@ -87,7 +105,7 @@ def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
 
 def _parquet() -> Any:
     try:
-        import pyarrow.parquet as parquet
+        from pyarrow import parquet
     except ImportError as error:
         raise HilError("parquet files need pyarrow: pip install pyarrow, or use .csv or .npz") from error
     return parquet
@@ -121,7 +139,9 @@ def read_start(path: Path) -> dict[str, float]:
     return start
 
 
-def navigate(table: FloatArray, start: dict[str, float], attitude: str, mechanization: str) -> FloatArray:
+def navigate(
+    table: FloatArray, start: dict[str, float], attitude: str, mechanization: str, gravity: str = "normal"
+) -> FloatArray:
     """Navigation rows (n, 10: `NAV_HEADER`) of IMU rows (n, 7: `IMU_HEADER`) from `start`.
 
     Raises
@@ -134,33 +154,28 @@ def navigate(table: FloatArray, start: dict[str, float], attitude: str, mechaniz
     wrong = np.flatnonzero(step <= 0.0)
     if len(wrong):
         k = int(wrong[0])
-        before = start["time_s"] if k == 0 else time[k - 1]
-        raise HilError(f"row {k + 1}: time_s = {time[k]!r} does not come after {before!r}")
-    navigator = Navigator(Settings(attitude=attitude, mechanization=mechanization))
-    navigator.begin(
+        before = start["time_s"] if k == 0 else float(time[k - 1])
+        raise HilError(f"row {k + 1}: time_s = {float(time[k])} does not come after {before}")
+    core = Strapdown(attitude, mechanization, gravity, whole_record=True)
+    core.start(
         math.radians(start["lat_deg"]),
         math.radians(start["lon_deg"]),
         start["height_m"],
         np.array([start["vel_north"], start["vel_east"], start["vel_down"]]),
         quaternion_from_euler(*np.radians([start["heading_deg"], start["pitch_deg"], start["roll_deg"]])),
-        start["time_s"],
     )
     n = len(table)
-    imu = ImuIncrements(
-        np.ascontiguousarray(time),
-        step,
-        np.ascontiguousarray(table[:, 1:4]),
-        np.ascontiguousarray(table[:, 4:7]),
-        np.zeros(n, np.int64),
-        np.arange(n),
-    )
-    return _nav_rows(navigator.process(imu))
-
-
-def _nav_rows(rows: NDArray[Any]) -> FloatArray:
-    angles = np.degrees(euler_angles(np.ascontiguousarray(rows["q_nb"])))
-    position = np.stack([np.degrees(rows["lat"]), np.degrees(rows["lon"]), rows["height"]], axis=1)
-    return np.column_stack([rows["time"], position, rows["vel_n"], angles[:, ::-1]])
+    position, velocity, quaternion = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
+    dtheta, dvel = np.ascontiguousarray(table[:, 1:4]), np.ascontiguousarray(table[:, 4:7])
+    done = core.advance(step, dtheta, dvel, np.zeros(3), position, velocity, quaternion)
+    if done < n:
+        raise HilError(
+            f"row {done + 1}: the {mechanization} mechanization is singular at the pole "
+            f"(latitude {math.degrees(core.solution[0]):.4f} deg); use wander, earth or inertial"
+        )
+    angles = np.degrees(euler_angles(quaternion))
+    place = np.column_stack([np.degrees(position[:, :2]), position[:, 2]])
+    return np.column_stack([time, place, velocity, angles[:, ::-1]])
 
 
 def thin(rows: FloatArray, every_s: float) -> FloatArray:

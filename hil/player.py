@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from hil.bridge import LoopOrder
 from hil.control import Control
 from hil.pacing import Pacer
 from hil.reference import Reference, interpolate_attitude
-from hil.scenario import Scenario, load
+from hil.scenario import Scenario, load, validated
 from hil.source import FileSource, is_own
 from hil.stats import Stats
 from nav.errors import HilError
@@ -45,9 +46,9 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         log = read_ulog(path)
         scenario = load(scenario_file) if scenario_file else _board_scenario(path, log)
         reference = Reference(
-            time=log.attitude_us * 1e-6,
+            time=np.asarray(log.attitude_us * 1e-6, float),
             q_nb=log.attitude,
-            gyro_time=log.time_us * 1e-6,
+            gyro_time=np.asarray(log.time_us * 1e-6, float),
             gyro=log.rate,
             start=float(log.time_us[0]) * 1e-6,
         )
@@ -56,7 +57,7 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
     if is_own(path):
         reader = RecordingReader.open(path)
         reader.close()
-        scenario = load(scenario_file) if scenario_file else Scenario.model_validate(reader.header["scenario"])
+        scenario = load(scenario_file) if scenario_file else _recorded_scenario(path, reader.header)
     elif path.suffix.lower() in {".log", ".blf", ".asc", ".trc", ".csv"}:
         scenario = load(scenario_file).with_changes(duration_s=None)
     else:
@@ -66,9 +67,16 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
     return LoopOrder(scenario, file=path, paced=paced), False
 
 
+def _recorded_scenario(path: Path, header: dict[str, Any]) -> Scenario:
+    table = header.get("scenario")
+    if not isinstance(table, dict):
+        raise HilError(f"recording {path}: its header holds no scenario; give one with --scenario")
+    return validated(table, f"in recording {path}")
+
+
 def _board_scenario(path: Path, log: ImuLog) -> Scenario:
     """For a board that cannot gyrocompass: level at the start, heading from the log's own estimate, bias kept at rest."""
-    times = log.attitude_us * 1e-6
+    times = np.asarray(log.attitude_us * 1e-6, float)
     at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
     heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])
     return Scenario.model_validate(

@@ -67,7 +67,8 @@ class Reference:
         """The reference samples that are compared with a solution at `times`."""
         if len(times) == 0:
             return np.zeros(len(self.time), bool)
-        return (self.time >= self.start + SETTLE_S) & (self.time >= times[0]) & (self.time <= times[-1])
+        chosen: NDArray[np.bool_] = (self.time >= max(self.start + SETTLE_S, times[0])) & (self.time <= times[-1])
+        return chosen
 
     def errors(self, times: FloatArray, attitudes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """(time, total, tilt, heading) of the difference at each compared reference sample, s and rad."""
@@ -94,7 +95,8 @@ class Reference:
         q, delta = self.q_nb[0].copy(), np.empty(4)
         for k in range(len(times)):
             if k:
-                from_rotation_vector(*(self.gyro[first + k] * (times[k] - times[k - 1])), delta)
+                turn = self.gyro[first + k] * (times[k] - times[k - 1])
+                from_rotation_vector(turn[0], turn[1], turn[2], delta)
                 multiply(q, delta, q)
                 normalise(q)
             attitudes[k] = q

@@ -161,7 +161,7 @@ class Ring:
 
     def push(self, rows: NDArray[Any]) -> None:
         """Write `rows` ((n,) of `dtype`, contiguous) and wake the readers."""
-        _push(self._head, self._locks, self._slots, rows.view(np.uint8).reshape(len(rows), -1))
+        _push(self._head, self._locks, self._slots, rows.view(np.uint8).reshape(len(rows), self.dtype.itemsize))
         for wake in self.wakes:
             wake.call()
 
@@ -175,7 +175,9 @@ class Ring:
         first : int
             Number of the first one; more than `number` means that the difference was lost to this reader.
         """
-        return _pull(self._head, self._locks, self._slots, rows.view(np.uint8).reshape(len(rows), -1), number)
+        return _pull(
+            self._head, self._locks, self._slots, rows.view(np.uint8).reshape(len(rows), self.dtype.itemsize), number
+        )
 
     def latest(self, row: NDArray[Any]) -> bool:
         """Copy the newest record into `row` ((1,) of `dtype`); False when there is none yet."""

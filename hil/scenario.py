@@ -119,12 +119,12 @@ class NavigationConfig(_Model):
     start: StartConfig = StartConfig()
     attitude: str = "two-sample"
     mechanization: str = "geographic"
-    gravity: Literal["normal"] = "normal"
+    gravity: Literal["normal", "j2"] = "normal"
     gap_interpolate_s: NotNegative = 0.1
     """Gaps up to this length are filled by interpolation; longer ones are bridged and the mode is degraded."""
     gap_realign_s: Positive = 10.0
     """After a gap longer than this nothing is bridged: the navigator aligns again."""
-    silence_s: Annotated[float, Field(gt=0, le=10)] = 0.1
+    silence_s: Annotated[float, Field(gt=0, le=10)] = 0.08
     """Without a sample for this long the mode is degraded."""
     track_bias_at_rest: bool = False
     """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
@@ -148,7 +148,8 @@ class Scenario(_Model):
     description: str = ""
     duration_s: Positive | None = None
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 0
-    bus: str = "unix:dtg-hil"
+    bus: str = ""
+    """Where the sensor is; empty: `hil run` brings its own simulated head on a private ``unix:`` bus."""
     driver: str = "dtg-head"
     motion: MotionConfig = MotionConfig()
     head: HeadConfig = HeadConfig()
@@ -157,7 +158,7 @@ class Scenario(_Model):
 
     def with_changes(self, **changes: Any) -> "Scenario":
         """A copy with `changes` laid over it (nested dictionaries reach nested keys), validated anew."""
-        return _validated(_merged(self.model_dump(mode="json"), changes), "command line")
+        return validated(_merged(self.model_dump(mode="json"), changes), "command line")
 
     def world_id(self) -> int:
         """A 32-bit fingerprint of what the simulated head does: motion, head and seed; never 0.
@@ -204,7 +205,7 @@ def parse(text: str, source: str) -> Scenario:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise HilError(f"scenario {source}: not TOML: {error}") from error
-    return _validated(table, source)
+    return validated(table, source)
 
 
 def built_in_names() -> list[str]:
@@ -213,7 +214,14 @@ def built_in_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def _validated(table: Mapping[str, Any], source: str) -> Scenario:
+def validated(table: Mapping[str, Any], source: str) -> Scenario:
+    """The scenario in a table of plain values; `source` names it in errors.
+
+    Raises
+    ------
+    HilError
+        A key is unknown or has a wrong value.
+    """
     try:
         return Scenario.model_validate(table)
     except ValidationError as error:

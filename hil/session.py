@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
+from hil.control import run_part
 from hil.publisher import run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -30,6 +31,9 @@ from nav.state import NAV_STATE, Mode
 
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
+READERS = ("recorder", "publisher")
+"""Parts that only read what the loop gives."""
+READER_NICE = 10
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
 DRAIN_S = 1.0
@@ -111,7 +115,12 @@ class Session:
 
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
-            process = context.Process(target=target, args=(*args, theirs), name=f"hil-{name}", daemon=True)
+            process = context.Process(
+                target=run_part,
+                args=(outlets.control, READER_NICE if name in READERS else 0, target, *args, theirs),
+                name=f"hil-{name}",
+                daemon=True,
+            )
             process.start()
             theirs.close()
             self._parts[name] = _Part(name, process, ours)
@@ -124,7 +133,9 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            launch("publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, self._publisher_stop)
+            launch(
+                "publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, self._publisher_stop
+            )
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -206,7 +217,8 @@ class Session:
         copied, first = self.outlets.events.pull(rows, self._event_number)
         self._event_number = first + copied
         return [
-            (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace")) for row in rows[:copied]
+            (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace"))
+            for row in rows[:copied]
         ]
 
     def stop(self) -> None:
@@ -222,7 +234,7 @@ class Session:
                 failed = f"the {part.name} process died (exit code {part.process.exitcode})"
             if not failed:
                 continue
-            if part.name in {"loop", "feeder"} or (part.name == "publisher" and not self.outlets.control.go):
+            if part.name in {"loop", "feeder"} or not self.outlets.control.go:
                 raise HilError(str(failed))
             if failed not in self.problems:
                 self.problems.append(str(failed))
@@ -255,8 +267,7 @@ class Session:
         names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
         more = ("restarts", "interpolated", "silences")
         wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
-        state = self.state()
-        device_s = self.device_seconds(state)
+        device_s = stats["covered_us"] * 1e-6
         result: dict[str, Any] = {"scenario": self.order.scenario.name}
         result.update({name: stats[name] for name in (*names, *more)})
         result["rate_hz"] = stats["samples"] / device_s if device_s > 0 else 0.0
@@ -276,10 +287,6 @@ class Session:
         if self.problems:
             result["problems"] = self.problems
         return result
-
-    def device_seconds(self, state: Any) -> float:
-        """Device time that the samples since the head's last start cover."""
-        return 0.0 if state is None else float(state["time"]) - self.outlets.stats["started_us"] * 1e-6
 
 
 def simulated_head(order: LoopOrder) -> tuple[Callable[..., None], Sequence[Any]]:

@@ -1,5 +1,6 @@
 """Counters of a run in shared memory: written by the loop alone, read by the status line, the publisher and the summary."""
 
+from collections.abc import Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from hil.ring import Shared
 
-LATENCY_BINS = 10_000
+LATENCY_BINS = 100_000
 """Bins of 1 us; the last one holds everything longer."""
 
 
@@ -42,7 +43,7 @@ _FIELDS = (
     "recorder_lost",
     "age_us",
     "position_error_mm",  # -1: no truth
-    "started_us",  # device time at which the first sample (of the head's last start) begins
+    "covered_us",  # device time from the first sample on, all lives of the device together
     "warm_loop",  # steps of `hil.warmup` that are done
     "warm_head",
 )
@@ -56,11 +57,17 @@ class Stats:
         self._shared = shared or Shared(STATS.itemsize)
         self.record: Any = np.frombuffer(self._shared.memory, STATS, 1)
         self._latency = self.record["latency"][0]
+        self._words = np.frombuffer(self._shared.memory, np.int64, len(_FIELDS))
         if shared is None:
             self.record["position_error_mm"] = -1
 
     def __reduce__(self) -> Any:
         return Stats, (self._shared,)
+
+    def set_block(self, first: str, values: Sequence[int]) -> None:
+        """Set the fields from `first` on."""
+        start = _FIELDS.index(first)
+        self._words[start : start + len(values)] = values
 
     def __getitem__(self, name: str) -> int:
         return int(self.record[name][0])
@@ -73,8 +80,7 @@ class Stats:
         for value in latencies_ns:
             microseconds = max(0, int(value) // 1000)
             self._latency[min(microseconds, LATENCY_BINS - 1)] += 1
-            if microseconds > self.record["latency_max_us"][0]:
-                self.record["latency_max_us"][0] = microseconds
+            self.record["latency_max_us"][0] = max(self.record["latency_max_us"][0], microseconds)
 
     def latency_us(self) -> dict[str, float]:
         """p50, p99, p999 and max of the latency, us; zeros when none was counted."""
@@ -86,4 +92,7 @@ class Stats:
             name: float(np.searchsorted(cumulated, np.ceil(part * total)))
             for name, part in (("p50", 0.5), ("p99", 0.99), ("p999", 0.999))
         }
-        return {**result, "max": float(self["latency_max_us"])}
+        longest = float(self["latency_max_us"])
+        if longest >= LATENCY_BINS - 1:  # the last bin says no more than that
+            result = {name: longest if value >= LATENCY_BINS - 1 else value for name, value in result.items()}
+        return {**result, "max": longest}

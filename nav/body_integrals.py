@@ -60,9 +60,7 @@ def turn_of(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 
 
 @inline_kernel
-def change_by_turn(
-    x: float, y: float, z: float, vx: float, vy: float, vz: float
-) -> tuple[float, float, float]:
+def change_by_turn(x: float, y: float, z: float, vx: float, vy: float, vz: float) -> tuple[float, float, float]:
     """What the rotation vector (x, y, z) changes of the vector v: exp([phi x]) v - v."""
     a2 = x * x + y * y + z * z
     if a2 < 1e-3:
@@ -138,15 +136,23 @@ def _integrate_polynomial(
         hx, hy, hz = s * gx, s * gy, s * gz
         if m > 1:
             kx, ky, kz = cross(
-                coefficient[0, 0], coefficient[0, 1], coefficient[0, 2],
-                coefficient[1, 0], coefficient[1, 1], coefficient[1, 2],
+                coefficient[0, 0],
+                coefficient[0, 1],
+                coefficient[0, 2],
+                coefficient[1, 0],
+                coefficient[1, 1],
+                coefficient[1, 2],
             )
             g = s * s * s / 12.0
             hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
         if m > 2:
             kx, ky, kz = cross(
-                coefficient[0, 0], coefficient[0, 1], coefficient[0, 2],
-                coefficient[2, 0], coefficient[2, 1], coefficient[2, 2],
+                coefficient[0, 0],
+                coefficient[0, 1],
+                coefficient[0, 2],
+                coefficient[2, 0],
+                coefficient[2, 1],
+                coefficient[2, 2],
             )
             g = s * s * s * s / 12.0
             hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
@@ -174,8 +180,12 @@ def _integrate_polynomial(
     c2x, c2y, c2z = cross(a1x, a1y, a1z, 2.0 * a3x + c1x, 2.0 * a3y + c1y, 2.0 * a3z + c1z)
     g = 1.0 / 60.0
     kx, ky, kz = cross(
-        a2x + g * c2x, a2y + g * c2y, a2z + g * c2z,
-        c1x - 20.0 * a1x - a3x, c1y - 20.0 * a1y - a3y, c1z - 20.0 * a1z - a3z,
+        a2x + g * c2x,
+        a2y + g * c2y,
+        a2z + g * c2z,
+        c1x - 20.0 * a1x - a3x,
+        c1y - 20.0 * a1y - a3y,
+        c1z - 20.0 * a1z - a3z,
     )
     g = 1.0 / 240.0
     dq[k, 0], dq[k, 1], dq[k, 2], dq[k, 3] = turn_of(

@@ -63,20 +63,24 @@ class GapFiller:
             return imu, []
         before = self._sequence
         last = len(imu) - 1
-        jumps = np.flatnonzero(np.diff(imu.sequence) != 1) + 1
-        if before is not None and imu.sequence[0] != before + 1:
-            jumps = np.concatenate(([0], jumps))
-        result, gaps = (imu, []) if len(jumps) == 0 else self._filled(imu, jumps)
-        self._sequence = int(imu.sequence[last])
+        first, newest = int(imu.sequence[0]), int(imu.sequence[last])
+        follows = before is None or first == before + 1
+        result = imu
+        gaps: list[Gap] = []
+        if not follows or newest - first != last:  # the driver hands samples on in rising order
+            jumps = np.flatnonzero(np.diff(imu.sequence) != 1) + 1
+            result, gaps = self._filled(imu, jumps if follows else np.concatenate(([0], jumps)))
+        self._sequence = newest
         self._time = float(imu.time[last])
         self._keep(imu, last)
         return result, gaps
 
     def _keep(self, imu: ImuIncrements, row: int) -> None:
-        step = imu.step[row]
-        if step > 0.0:
-            self._rate[:] = imu.dtheta[row] / step
-            self._force[:] = imu.dvel[row] / step
+        while row >= 0 and imu.step[row] <= 0.0:  # a sample without length has no rate: the one before it counts
+            row -= 1
+        if row >= 0:
+            self._rate[:] = imu.dtheta[row] / imu.step[row]
+            self._force[:] = imu.dvel[row] / imu.step[row]
 
     def _filled(self, imu: ImuIncrements, jumps: np.ndarray) -> tuple[ImuIncrements, list[Gap]]:
         parts: list[ImuIncrements] = []
@@ -95,7 +99,7 @@ class GapFiller:
             step = float(imu.step[stop])
             length = float(imu.time[stop]) - step - time
             missing = int(imu.sequence[stop]) - sequence - 1
-            realign = length > self.policy.realign_s or length < 0.0 or step <= 0.0
+            realign = length > self.policy.realign_s or length < -1e-9 or step <= 0.0
             gaps.append(Gap(rows, time, length, missing, realign))
             if not realign and length > 1e-9:
                 bridged = length > self.policy.interpolate_s
@@ -118,7 +122,7 @@ class GapFiller:
         mark = int(Validity.INTERPOLATED | (Validity.BRIDGED if bridged else Validity.GOOD))
         numbers = sequence + 1 + (np.arange(count) * max(missing, 1)) // count
         return ImuIncrements(
-            time + step * np.arange(1, count + 1),
+            time + step * np.arange(1.0, count + 1.0),
             np.full(count, step),
             rate * step,
             force * step,

@@ -4,14 +4,28 @@ A batch is a set of equally long arrays, one row a sample. `ImuIncrements` is wh
 `HeadIncrements` is what a dual-DTG head delivers before :mod:`nav.instruments.head` turns it into `ImuIncrements`.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nav.kernel import kernel
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+
+
+@kernel
+def _first_bad(time: FloatArray, step: FloatArray, dtheta: FloatArray, dvel: FloatArray) -> int:
+    for k in range(time.shape[0]):
+        total = time[k] + step[k]
+        for i in range(3):
+            total += dtheta[k, i] + dvel[k, i]
+        if not math.isfinite(total):
+            return k
+    return -1
 
 
 class Validity(IntFlag):
@@ -55,6 +69,10 @@ class ImuIncrements:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def first_bad(self) -> int:
+        """Row of the first sample that holds a value that is not finite; -1 when there is none."""
+        return int(_first_bad(self.time, self.step, self.dtheta, self.dvel))
 
     def rows(self, start: int, stop: int) -> "ImuIncrements":
         """The samples `start` to `stop` as views."""

@@ -34,6 +34,10 @@ def shift(
         meridian, prime = curvature_radii(math.sin(lat[k]))
         lat[k] += r[0] / (meridian + height[k])
         lon[k] += r[1] / ((prime + height[k]) * math.cos(lat[k]))
+        if lon[k] > math.pi:
+            lon[k] -= 2.0 * math.pi
+        elif lon[k] < -math.pi:
+            lon[k] += 2.0 * math.pi
         height[k] -= r[2]
         for i in range(3):
             vel_n[k, i] += v[i]

@@ -17,15 +17,17 @@ from nav.alignment.analytic import AlignmentRefused, earth_rate_in_body, gyrocom
 from nav.errors import HilError
 from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, Validity
-from nav.mechanization import check_choice, geographic
+from nav.lever_arm import shift
 from nav.rotation import euler_from_quaternion
 from nav.state import NAV_STATE, Health, Mode
+from nav.strapdown import Strapdown
 
 StateArray = NDArray[Any]
 Severity = Literal["info", "notice", "warning", "error"]
 
 DISTRUST = Health.SILENT | Health.BRIDGED | Health.SENSOR
 """Health that makes the mode DEGRADED."""
+_LAT, _LON, _HEIGHT, _VEL, _Q = slice(0, 1), slice(1, 2), slice(2, 3), slice(3, 6), slice(6, 10)
 REST_WINDOW_S = 2.0
 """Length of the windows in which the bias is tracked at rest, s."""
 REST_GAIN = 0.2
@@ -52,6 +54,8 @@ class Settings:
         Keep averaging the gyro bias at rest.
     position_trusted : bool
         False marks the solution `Health.UNAIDED`.
+    lever_arm : tuple of float
+        From the navigated point to the sensor, body axes, m. What goes in and out is the navigated point.
     """
 
     lat: float = 0.0
@@ -64,6 +68,8 @@ class Settings:
     position_trusted: bool = True
     attitude: str = "two-sample"
     mechanization: str = "geographic"
+    gravity: str = "normal"
+    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gaps: GapPolicy = field(default_factory=GapPolicy)
 
 
@@ -86,7 +92,7 @@ class Navigator:
     """
 
     def __init__(self, settings: Settings) -> None:
-        check_choice(settings.attitude, settings.mechanization)
+        self._core = Strapdown(settings.attitude, settings.mechanization, settings.gravity)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -96,9 +102,8 @@ class Navigator:
         self.heading = settings.heading
         self._filler = GapFiller(settings.gaps)
         self._sums = np.zeros(rest.SUMS)
-        self._state = geographic.initial_state(
-            settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4)
-        )
+        self._state = _solution(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
+        self._arm = np.asarray(settings.lever_arm, float)
         self._progress = 0.0
         self._events: list[Event] = []
         self._rows = np.zeros(256, NAV_STATE)
@@ -109,9 +114,24 @@ class Navigator:
         events, self._events = self._events, []
         return events
 
-    def begin(self, lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, time: float) -> None:
-        """Navigate from a known state (position rad and m, velocity m/s, attitude) instead of aligning."""
-        self._state = geographic.initial_state(lat, lon, height, vel_n, q_nb)
+    def begin(
+        self,
+        lat: float,
+        lon: float,
+        height: float,
+        vel_n: FloatArray,
+        q_nb: FloatArray,
+        time: float,
+        w_ib_b: FloatArray | None = None,
+    ) -> None:
+        """Navigate from a known state of the navigated point instead of aligning.
+
+        Position in rad and m, velocity in m/s; the body rate (rad/s) matters with a lever arm only.
+        """
+        self._state = _solution(lat, lon, height, vel_n, q_nb)
+        self._move(1.0, w_ib_b)
+        self._start_core()
+        self._sums[:] = 0.0
         self._progress = 1.0
         self._say(time, "info", "navigating from a given start")
         self.mode = Mode.NAVIGATE
@@ -122,7 +142,10 @@ class Navigator:
         self.health &= ~(Health.BRIDGED | Health.MOVING | Health.UNITS | Health.RATE_TOO_SMALL)
         self._sums[:] = 0.0
         self._progress = 0.0
-        self._state = geographic.initial_state(*self._state[:3], np.zeros(3), np.zeros(4))
+        if self._state[6:10].any():
+            self._move(-1.0)
+        lat, lon, height = self._state[:3]
+        self._state = _solution(lat, lon, height, np.zeros(3), np.zeros(4))
         self._say(time, "notice", f"aligning: {reason}")
 
     def silent(self) -> StateArray:
@@ -143,9 +166,9 @@ class Navigator:
         HilError
             An increment is not finite.
         """
-        if not math.isfinite(float(imu.dtheta.sum()) + float(imu.dvel.sum()) + float(imu.time.sum())):
-            bad = ~(np.isfinite(imu.dtheta).all(1) & np.isfinite(imu.dvel).all(1) & np.isfinite(imu.time))
-            raise HilError(f"increment {int(imu.sequence[bad][0])} is not a number: mend the driver or the file")
+        bad = imu.first_bad()
+        if bad >= 0:
+            raise HilError(f"increment {int(imu.sequence[bad])} is not a number: mend the driver or the file")
         imu, gaps = self._filler.fill(imu)
         n = len(imu)
         if n == 0:
@@ -157,7 +180,8 @@ class Navigator:
         if self.health & Health.SILENT:
             self.health &= ~Health.SILENT
             self._say(float(imu.time[0]), "notice", "samples arrive again")
-            self._trust(float(imu.time[0]))
+            if not (gaps and gaps[0].realign):
+                self._trust(float(imu.time[0]))
         start = 0
         for gap in gaps:
             self._run(imu, rows, start, gap.row)
@@ -167,8 +191,25 @@ class Navigator:
         step = np.where(imu.step > 0.0, imu.step, 1.0)[:, None]
         rows["w_ib_b"] = imu.dtheta / step - rows["gyro_bias"]
         rows["f_b"] = imu.dvel / step
+        if self._arm.any():
+            there = np.ascontiguousarray(rows[rows["mode"] >= Mode.NAVIGATE])
+            point = there["lat"], there["lon"], there["height"], there["vel_n"]
+            shift(*point, there["q_nb"], there["w_ib_b"], -self._arm)
+            rows[rows["mode"] >= Mode.NAVIGATE] = there
         self._rows[0] = rows[-1]  # what `silent` repeats
         return rows
+
+    def _move(self, sign: float, w_ib_b: FloatArray | None = None) -> None:
+        """Move the state from the navigated point to the sensor (`sign` 1) or back (-1)."""
+        if not self._arm.any():
+            return
+        lat, lon, height, vel_n, q_nb = (self._state[part] for part in (_LAT, _LON, _HEIGHT, _VEL, _Q))
+        rate = np.zeros((1, 3)) if w_ib_b is None else np.asarray(w_ib_b, float).reshape(1, 3)
+        shift(lat, lon, height, vel_n.reshape(1, 3), q_nb.reshape(1, 4), rate, sign * self._arm)
+
+    def _start_core(self) -> None:
+        lat, lon, height = self._state[:3]
+        self._core.start(lat, lon, height, self._state[3:6], self._state[6:10])
 
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):
@@ -201,7 +242,7 @@ class Navigator:
             self._complain(time, Health.MOVING, "alignment waits: the vehicle moves")
         elif event:
             self._judge(time, event == 2)
-        self._progress = 1.0 if self.mode == Mode.NAVIGATE else rest.progress(self._sums, goal)
+        self._progress = rest.progress(self._sums, goal) if self.mode == Mode.ALIGN else 1.0
         self._fill_constant(rows[last : last + 1])
         return used
 
@@ -229,6 +270,8 @@ class Navigator:
         self.gyro_bias = result.gyro_bias
         self._sums[:] = 0.0
         self._state[6:10] = result.q_nb
+        self._move(1.0)
+        self._start_core()
         self.mode = Mode.NAVIGATE
         heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(result.q_nb))
         self._say(
@@ -237,6 +280,7 @@ class Navigator:
             f"aligned in {mean.time_s:.1f} s: heading {heading:.3f} pitch {pitch:.3f} roll {roll:.3f} deg, "
             f"{np.linalg.norm(mean.f) / 9.80665:.3f} g",
         )
+        self._trust(time)
 
     def _navigate(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
         event = 0
@@ -247,8 +291,7 @@ class Navigator:
             stop = start + used
         n = stop - start
         position, velocity, attitude = (array[:n] for array in self._scratch)
-        done = geographic.advance(
-            self._state,
+        done = self._core.advance(
             imu.step[start:stop],
             imu.dtheta[start:stop],
             imu.dvel[start:stop],
@@ -257,6 +300,7 @@ class Navigator:
             velocity,
             attitude,
         )
+        self._state[:] = self._core.solution
         if done < n:
             raise HilError(
                 f"the geographic mechanization is singular at the pole: stopped at latitude "
@@ -288,6 +332,8 @@ class Navigator:
         if self.mode in (Mode.INIT, Mode.ALIGN):
             return
         what = f"gap of {gap.length_s:.3f} s, {gap.missing} samples"
+        if gap.length_s < 0.0:
+            what = "the sensor started anew"
         if gap.realign:
             self.realign(gap.time, what)
         elif gap.length_s > self.settings.gaps.interpolate_s:
@@ -315,3 +361,8 @@ class Navigator:
         part["lat"], part["lon"], part["height"] = self._state[0], self._state[1], self._state[2]
         part["vel_n"], part["q_nb"], part["gyro_bias"] = self._state[3:6], self._state[6:10], self.gyro_bias
         part["progress"] = self._progress
+
+
+def _solution(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> FloatArray:
+    """lat, lon, height, vel_n (3), q_nb (4) in one array, as `Strapdown.solution`."""
+    return np.array([lat, lon, height, *vel_n, *q_nb], float)

@@ -130,7 +130,10 @@ def euler_from_quaternion(q: FloatArray) -> tuple[float, float, float]:
         roll = 0.0
         heading = -2.0 * math.copysign(1.0, s) * math.atan2(q[1], q[0])
     pitch = math.asin(min(1.0, max(-1.0, s)))
-    return heading % (2.0 * math.pi), pitch, roll
+    heading %= 2.0 * math.pi
+    if heading >= 2.0 * math.pi:  # the remainder of a tiny negative angle rounds up to the whole turn
+        heading = 0.0
+    return heading, pitch, roll
 
 
 @kernel

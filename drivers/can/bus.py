@@ -1,7 +1,7 @@
 """Opening a bus by URL: the bulk interface that the bridge, the head and the tools use on every CAN back end.
 
-``unix:NAME`` is our own (:mod:`drivers.can.unix_bus`); anything else is python-can: ``socketcan:vcan0``, ``virtual:NAME``,
-``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
+``unix:NAME`` (:mod:`drivers.can.unix_bus`) and ``socketcan:vcan0`` (:mod:`drivers.can.socketcan`) are our own; anything else
+is python-can: ``virtual:NAME``, ``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ import can
 
 from drivers.can.convert import from_message, to_message
 from drivers.can.frames import FrameArray
+from drivers.can.socketcan import SocketCanPort, explain
 from drivers.can.unix_bus import UnixPort
 from nav.errors import HilError
 
@@ -64,6 +65,8 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
         if query:
             raise HilError(f"bus {url!r}: unix: takes no options")
         return UnixPort(channel, listen=listen, lossless=lossless)
+    if interface == "socketcan" and not query:
+        return SocketCanPort(channel, listen=listen)
     options = {key: _typed(value) for key, value in parse_qsl(query, keep_blank_values=True)}
     return PythonCanPort(url, interface, channel, options)
 
@@ -161,18 +164,9 @@ def _typed(text: str) -> Any:
 
 
 def _reason(arguments: dict[str, Any], error: Exception) -> str:
-    interface, channel = arguments["interface"], arguments["channel"]
-    code = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    interface = arguments["interface"]
     if interface == "socketcan":
-        if not hasattr(socket, "AF_CAN") or code == errno.EAFNOSUPPORT:
-            return "this kernel has no SocketCAN; use unix:NAME or udp_multicast:239.74.163.2 (see: hil doctor)"
-        if code in {errno.ENODEV, errno.ENXIO}:
-            make = f"ip link add {channel} type vcan && ip link set {channel} mtu 72 up"
-            if not channel.startswith("vcan"):
-                make = f"ip link set {channel} up type can bitrate 500000 dbitrate 2000000 fd on"
-            return f"no interface {channel}; make it with: sudo sh -c '{make}' (see: hil doctor)"
-        if code == errno.ENETDOWN:
-            return f"interface {channel} is down; raise it with: sudo ip link set {channel} up"
+        return explain(arguments["channel"], error)
     if isinstance(error, can.CanInterfaceNotImplementedError):
         return f"python-can knows no interface {interface!r} (or its library is missing): {error}"
     return f"{error}"

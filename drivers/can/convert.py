@@ -17,7 +17,7 @@ def from_message(message: can.Message, row: Any) -> None:
         | (RTR if message.is_remote_frame else 0)
         | (ERR if message.is_error_frame else 0)
     )
-    row["length"] = len(data)
+    row["length"] = message.dlc if message.is_remote_frame else len(data)
     row["flags"] = (
         (FDF if message.is_fd else 0)
         | (BRS if message.bitrate_switch else 0)
@@ -32,16 +32,17 @@ def from_message(message: can.Message, row: Any) -> None:
 def to_message(row: Any, channel: str | None = None) -> can.Message:
     """The python-can message of one `FRAME` record."""
     can_id, flags = int(row["can_id"]), int(row["flags"])
-    extended = bool(can_id & EFF)
+    extended, remote, length = bool(can_id & EFF), bool(can_id & RTR), int(row["length"])
     return can.Message(
         timestamp=int(row["time_ns"]) * 1e-9,
         arbitration_id=can_id & (0x1FFFFFFF if extended else 0x7FF),
         is_extended_id=extended,
-        is_remote_frame=bool(can_id & RTR),
+        is_remote_frame=remote,
         is_error_frame=bool(can_id & ERR),
         is_fd=bool(flags & FDF),
         bitrate_switch=bool(flags & BRS),
         error_state_indicator=bool(flags & ESI),
-        data=bytes(row["data"][: int(row["length"])]),
+        dlc=length,
+        data=None if remote else bytes(row["data"][:length]),
         channel=channel,
     )

@@ -59,6 +59,7 @@ def _signed32(value: int) -> int:
 def _track(
     values: FloatArray,
     good: NDArray[np.bool_],
+    periods: IntArray,
     state: IntArray,
     outcome: IntArray,
     time: FloatArray,
@@ -79,11 +80,11 @@ def _track(
         counter, us = int(values[k, _COUNTER]), int(values[k, _TIME])
         delta = _signed32(counter - state[_LAST_COUNTER])
         elapsed = _signed32(us - state[_LAST_US])
-        period = state[_PERIOD_US]
+        period = periods[k]
         if state[_STARTED] == 0:
             state[_STARTED] = 1
             state[_SEQUENCE], state[_TIME_US] = counter, us
-            state[_SEEN] = 1
+            state[_SEEN] = -1  # one from before the first was never counted as lost
             step_us = float(period)
         elif delta > 0 and elapsed > 0:
             outcome[_LOST] += delta - 1
@@ -103,7 +104,7 @@ def _track(
             outcome[_RESTARTS] += 1
             state[_SEQUENCE] += 2  # any jump: the navigator sees that time does not go on
             state[_TIME_US] = us
-            state[_SEEN] = 1
+            state[_SEEN] = -1
             step_us = float(period)
         state[_LAST_COUNTER], state[_LAST_US] = counter, us
         if step_us <= 0.0:  # the first sample of a head that has not said its period: it only sets the clock
@@ -119,7 +120,12 @@ def _track(
 
 @kernel
 def _join(
-    kind: IntArray, data: NDArray[np.uint8], partial: NDArray[np.uint8], state: IntArray, joined: NDArray[np.uint8], last: IntArray
+    kind: IntArray,
+    data: NDArray[np.uint8],
+    partial: NDArray[np.uint8],
+    state: IntArray,
+    joined: NDArray[np.uint8],
+    last: IntArray,
 ) -> tuple[int, int]:
     """Collect the six classic frames of a sample; returns (complete samples, duplicate frames)."""
     n = duplicates = 0
@@ -131,8 +137,13 @@ def _join(
         if number != state[0]:
             state[0], state[1] = number, 0
         if state[1] & bit:
-            duplicates += 1
-            continue
+            again = True
+            for i in range(8):
+                again = again and partial[kind[k], i] == data[k, i]
+            if again:
+                duplicates += 1
+                continue
+            state[1] = 0  # the same number a whole turn of it later: what was begun is never completed
         state[1] |= bit
         for i in range(8):
             partial[kind[k], i] = data[k, i]
@@ -180,6 +191,7 @@ class DtgHead:
         self._values = np.zeros((n, _COLUMNS))
         self._good = np.zeros(n, np.bool_)
         self._rows = np.zeros(n, np.int64)
+        self._periods = np.zeros(n, np.int64)
 
     def identity(self) -> dict[str, object]:
         """Serial, hardware, sample period, temperatures, rotor speeds, supply and built-in test, as last heard."""
@@ -197,28 +209,31 @@ class DtgHead:
         self.counters.frames += n
         ids = batch["can_id"]
         is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
+        periods = self._periods[:n]
+        periods[:] = self._state[_PERIOD_US]
         if is_sample.all():
             self._data[:n] = batch["data"]
-            return self._samples(n, batch["time_ns"])
-        self._others(batch[~is_sample])
+            return self._samples(n, batch["time_ns"], periods)
+        self._others(batch, np.flatnonzero(~is_sample), periods)
         chosen = batch[is_sample]
         if len(chosen):
             self._data[: len(chosen)] = chosen["data"]
-            return self._samples(len(chosen), chosen["time_ns"])
-        return self._classic_samples(batch)
+            return self._samples(len(chosen), chosen["time_ns"], periods[is_sample])
+        return self._classic_samples(batch, periods)
 
-    def _samples(self, n: int, times: IntArray) -> HeadIncrements:
+    def _samples(self, n: int, times: IntArray, periods: IntArray) -> HeadIncrements:
         data = self._data[:n]
         self._protection["HEAD_SAMPLE"].check(data, self._good[:n])
         self._sample.decode(data, self._raw[:n])
         self._values[:n] = self._raw[:n, self._columns]
-        return self._accept(n, times)
+        return self._accept(n, times, periods)
 
-    def _accept(self, n: int, times: IntArray) -> HeadIncrements:
+    def _accept(self, n: int, times: IntArray, periods: IntArray) -> HeadIncrements:
         batch, values = self._batch, self._values[:n]
         count = _track(
             values,
             self._good[:n],
+            periods,
             self._state,
             self._outcome,
             batch.time,
@@ -238,7 +253,11 @@ class DtgHead:
             result.rotor[invalid] = np.nan
         self._arrivals = times[rows]
         counters, outcome = self.counters, self._outcome
-        counters.samples, counters.lost, counters.late = int(outcome[_SAMPLES]), int(outcome[_LOST]), int(outcome[_LATE])
+        counters.samples, counters.lost, counters.late = (
+            int(outcome[_SAMPLES]),
+            int(outcome[_LOST]),
+            int(outcome[_LATE]),
+        )
         counters.restarts = int(outcome[_RESTARTS])
         counters.duplicated += int(outcome[_DUPLICATED])
         counters.crc_errors += int(outcome[_CRC])
@@ -246,15 +265,17 @@ class DtgHead:
         outcome[_DUPLICATED] = outcome[_CRC] = outcome[_VERSION] = 0
         return result
 
-    def _others(self, batch: FrameArray) -> None:
-        """Count what is not a sample and read the slow frames."""
-        for row in batch:
+    def _others(self, batch: FrameArray, chosen: IntArray, periods: IntArray) -> None:
+        """Count what is not a sample and read the slow frames; the period that one says holds for what follows it."""
+        for k in chosen:
+            row = batch[k]
             can_id, length = int(row["can_id"]), int(row["length"])
             if can_id in self._kinds and length == 8:
                 continue
             codec = self._slow.get(can_id)
             if codec is not None and length == 8:
                 self._read_slow(codec, row["data"][None, :8])
+                periods[k:] = self._state[_PERIOD_US]
             elif can_id & ERR or can_id & RTR or can_id & EFF or not self._is_ours(can_id):
                 self.counters.foreign += 1
             else:
@@ -277,7 +298,7 @@ class DtgHead:
             self.period_s = said["sample_period"] * 1e-6
         self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
 
-    def _classic_samples(self, batch: FrameArray) -> HeadIncrements:
+    def _classic_samples(self, batch: FrameArray, periods: IntArray) -> HeadIncrements:
         ids, eight = batch["can_id"], batch["length"] == 8
         kind = np.full(len(batch), -1, np.int64)
         data = np.ascontiguousarray(batch["data"][:, :8])
@@ -302,4 +323,4 @@ class DtgHead:
             else:
                 values[:, column] = part.get(name, 0.0)
         self._good[:n] = True
-        return self._accept(n, batch["time_ns"][last[:n]])
+        return self._accept(n, batch["time_ns"][last[:n]], periods[last[:n]])

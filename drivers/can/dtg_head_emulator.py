@@ -73,7 +73,7 @@ class HeadEncoder:
             if declared is None:
                 raise HilError(f"dtg_head.dbc: message {codec.name} has no E2EProfile")
             self._protection[codec.name] = declared
-        self._said = {
+        self._said: dict[str, dict[str, float]] = {
             "HEAD_IDENTITY": {"serial": serial, "protocol": PROTOCOL, "hardware": hardware},
             "HEAD_CONFIG": {"world_id": world_id, "sample_period": period_us},
             "HEAD_TEMPERATURE": {"temperature_g1": 40.0, "temperature_g2": 40.0, "temperature_acc": 35.0},

@@ -29,6 +29,10 @@ from nav.errors import HilError
 PACKET = 64
 """Most frames in one packet."""
 _BUFFER = 4 << 20
+_MUTE = "-mute"
+"""End of the socket's name of a pure sender."""
+_BACKLOG = 4096
+"""Most participants that may join while one does not look."""
 
 
 class UnixPort:
@@ -60,26 +64,38 @@ class UnixPort:
         self._peers: dict[int, socket.socket] = {}
         self._deaf: set[int] = set()
         self._epoll = select.epoll()
-        folder = _folder(name)
-        self._path = folder / f"{os.getpid()}-{time.monotonic_ns():x}.sock"
-        with _locked(folder):
-            others = [entry for entry in folder.glob("*.sock") if entry != self._path]
-            self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-            self._listener.bind(str(self._path))
-            self._listener.listen(64)
-            self._epoll.register(self._listener, select.EPOLLIN)
-            for other in others:
-                self._connect(other)
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            folder = _folder(name)
+            self._path = folder / f"{os.getpid()}-{time.monotonic_ns():x}{'' if listen else _MUTE}.sock"
+            with _locked(folder):
+                others = list(folder.glob("*.sock"))
+                self._listener.bind(str(self._path))
+                self._listener.listen(_BACKLOG)
+                self._epoll.register(self._listener, select.EPOLLIN)
+                for other in others:
+                    self._connect(other)
+        except OSError as error:  # the folder is another user's or not writable, or its path is too long for a socket
+            self._listener.close()
+            self._epoll.close()
+            raise HilError(
+                f"unix:{name}: {error}; set XDG_RUNTIME_DIR to a folder of yours with a short path"
+            ) from error
 
     def _connect(self, path: Path) -> None:
         peer = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         try:
             peer.connect(str(path))
-        except OSError:  # its owner died without cleaning up
+        except (ConnectionRefusedError, FileNotFoundError):  # its owner died without cleaning up
             peer.close()
             path.unlink(missing_ok=True)
             return
+        except OSError:  # its owner lives but its queue of joiners is full: it has not looked for a long time
+            peer.close()
+            return
         self._add(peer)
+        if path.stem.endswith(_MUTE):  # it may not have accepted us yet: nothing may be queued for it
+            self._deaf.add(peer.fileno())
 
     def _add(self, peer: socket.socket) -> None:
         for option in (getattr(socket, "SO_SNDBUFFORCE", 32), socket.SO_SNDBUF):
@@ -121,7 +137,7 @@ class UnixPort:
         """Fill `batch` (at least `PACKET` long) with what is there; waits up to `timeout` s for the first frame."""
         filled = 0
         deadline = time.monotonic() + timeout
-        view = memoryview(batch.view(np.uint8))
+        view = batch.view(np.uint8).data
         while filled == 0:
             ready = self._epoll.poll(max(0.0, deadline - time.monotonic()))
             if not ready:
@@ -185,6 +201,10 @@ class UnixBus(can.BusABC):
 
     def __init__(self, channel: str, can_filters: Any = None, **kwargs: Any) -> None:
         self._port = UnixPort(channel)
+        self._waiting = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)  # readable while messages wait in our queue
+        self._either = select.epoll()
+        self._either.register(self._port.fileno(), select.EPOLLIN)
+        self._either.register(self._waiting, select.EPOLLIN)
         self._batch = frames(2 * PACKET)
         self._one = frames(1)
         self._queue: list[can.Message] = []
@@ -196,7 +216,13 @@ class UnixBus(can.BusABC):
         if not self._queue:
             n = self._port.receive(self._batch, 3600.0 if timeout is None else timeout)
             self._queue = [to_message(row, self.channel_info) for row in self._batch[:n]][::-1]
-        return (self._queue.pop() if self._queue else None), False
+            if n > 1:
+                os.eventfd_write(self._waiting, 1)
+        message = self._queue.pop() if self._queue else None
+        if not self._queue:
+            with contextlib.suppress(BlockingIOError):
+                os.eventfd_read(self._waiting)
+        return message, False
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send one message to every listener."""
@@ -205,12 +231,14 @@ class UnixBus(can.BusABC):
 
     def fileno(self) -> int:
         """Readable when a message can be received."""
-        return self._port.fileno()
+        return self._either.fileno()
 
     def shutdown(self) -> None:
         """Leave the bus."""
         if not self._is_shutdown:
             self._port.close()
+            self._either.close()
+            os.close(self._waiting)
         super().shutdown()
 
 

@@ -83,7 +83,14 @@ def gyrocompass(
     f = float(np.linalg.norm(f_b))
     up = f_b / f
     north = w_ib_b - np.dot(w_ib_b, up) * up  # the vertical part is removed by geometry: exact for a noisy rate too
-    north = north / np.linalg.norm(north)
+    level_rate = float(np.linalg.norm(north))
+    if level_rate < max(SIGMAS * sigma_w, 1e-3 * RATE):
+        raise AlignmentRefused(
+            f"gyrocompassing is impossible: the measured rate stands upright, {math.degrees(level_rate) * 3600:.3g} deg/h "
+            f"lie in the level where latitude {math.degrees(lat):.3f} deg has {math.degrees(north_rate) * 3600:.3g}; mend the "
+            "latitude or the mounting"
+        )
+    north = north / level_rate
     east = np.cross(north, up)
     q_nb = quaternion_from_dcm(np.ascontiguousarray(np.stack([north, east, -up])))
     return Alignment(q_nb, np.zeros(3), sigma_f / f, math.hypot(sigma_w / north_rate, math.tan(lat) * sigma_f / f))

@@ -11,7 +11,9 @@ from nav.kernel import kernel
 
 
 @kernel
-def _combine(head_dtheta: FloatArray, head_dvel: FloatArray, c_bh: FloatArray, dtheta: FloatArray, dvel: FloatArray) -> None:
+def _combine(
+    head_dtheta: FloatArray, head_dvel: FloatArray, c_bh: FloatArray, dtheta: FloatArray, dvel: FloatArray
+) -> None:
     for k in range(head_dtheta.shape[0]):
         x, y = head_dtheta[k, 0], 0.5 * (head_dtheta[k, 1] + head_dtheta[k, 2])
         z = head_dtheta[k, 3]

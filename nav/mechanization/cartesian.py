@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from nav.body_integrals import change_by_turn, cross, turn_of
+from nav.body_integrals import cross, turn_of
 from nav.earth import E2, RATE, A, curvature_radii
 from nav.gravitation import gravitation_cartesian, near_latitude
 from nav.increments import FloatArray
@@ -24,9 +24,7 @@ of the latitude | time since the axes of i and e coincided, what rounding left o
 _LOW_R, _LOW_Q, _G, _G_STEP, _LAT, _TIME = 10, 13, 17, 20, 21, 23
 
 
-def start(
-    lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, turn_rate: float
-) -> FloatArray:
+def start(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, turn_rate: float) -> FloatArray:
     """State vector of the inertial (`turn_rate` = 0) or Earth-fixed (`turn_rate` = RATE) mechanization.
 
     Parameters as in :func:`nav.mechanization.geographic.start`. The inertial axes are those of e now.
@@ -218,8 +216,23 @@ def advance(
             time = low
             sin_lat, cos_lat = near_latitude(math.sqrt(rx * rx + ry * ry), rz, sin_lat, cos_lat)
         _answer(
-            ahead * time, rx, ry, rz, vx + ahead * ry, vy - ahead * rx, vz, a, b, c, d, sin_lat, cos_lat, k,
-            position, velocity, attitude,
+            ahead * time,
+            rx,
+            ry,
+            rz,
+            vx + ahead * ry,
+            vy - ahead * rx,
+            vz,
+            a,
+            b,
+            c,
+            d,
+            sin_lat,
+            cos_lat,
+            k,
+            position,
+            velocity,
+            attitude,
         )
     state[0], state[1], state[2] = rx, ry, rz
     state[3], state[4], state[5] = vx, vy, vz
@@ -228,4 +241,85 @@ def advance(
     state[_LOW_Q], state[_LOW_Q + 1], state[_LOW_Q + 2], state[_LOW_Q + 3] = a_low, b_low, c_low, d_low
     state[_G], state[_G + 1], state[_G + 2], state[_G_STEP] = gx, gy, gz, g_step
     state[_LAT], state[_LAT + 1], state[_TIME], state[_TIME + 1] = sin_lat, cos_lat, time, time_low
-    return step.shape[0]
+    return len(step)
+
+
+@kernel
+def advance_source(
+    state: FloatArray,
+    field: int,
+    step: FloatArray,
+    dtheta: FloatArray,
+    dvel: FloatArray,
+    previous: FloatArray,
+    position: FloatArray,
+    velocity: FloatArray,
+    attitude: FloatArray,
+) -> int:
+    """Inertial mechanization as source 000 prints it (Uspensky & Bagmut 2009, eqs. 13-17); first order in the step.
+
+    ``dV = C (dv + dth x dv / 2) + g(R) T``, ``R += (V + V') T / 2``, attitude by Picard 3 with the source's scaling of the
+    previous increment. `state` as of `start` with turn rate 0; `dtheta` and `dvel` are raw increments; `previous` (4,) is
+    the increment and the step before, zeros at the start.
+    """
+    rx, ry, rz = state[0], state[1], state[2]
+    vx, vy, vz = state[3], state[4], state[5]
+    a, b, c, d = state[6], state[7], state[8], state[9]
+    sin_lat, cos_lat, time = state[_LAT], state[_LAT + 1], state[_TIME]
+    for k in range(step.shape[0]):
+        t = step[k]
+        if t > 0.0:
+            x, y, z = dtheta[k, 0], dtheta[k, 1], dtheta[k, 2]
+            ux, uy, uz = cross(x, y, z, dvel[k, 0], dvel[k, 1], dvel[k, 2])
+            ux, uy, uz = dvel[k, 0] + 0.5 * ux, dvel[k, 1] + 0.5 * uy, dvel[k, 2] + 0.5 * uz
+            px, py, pz = cross(b, c, d, ux, uy, uz)
+            px, py, pz = 2.0 * px, 2.0 * py, 2.0 * pz
+            qx, qy, qz = cross(b, c, d, px, py, pz)
+            gx, gy, gz = gravitation_cartesian(field, rx, ry, rz, sin_lat, cos_lat)
+            nx, ny, nz = (
+                vx + ux + a * px + qx + gx * t,
+                vy + uy + a * py + qy + gy * t,
+                vz + uz + a * pz + qz + gz * t,
+            )
+            rx, ry, rz = rx + 0.5 * t * (vx + nx), ry + 0.5 * t * (vy + ny), rz + 0.5 * t * (vz + nz)
+            vx, vy, vz = nx, ny, nz
+            scale = t / previous[3] if previous[3] > 0.0 else 0.0
+            px, py, pz = cross(x, y, z, scale * previous[0], scale * previous[1], scale * previous[2])
+            th2 = x * x + y * y + z * z
+            g = 0.5 - th2 / 48.0
+            previous[0], previous[1], previous[2], previous[3] = x, y, z, t
+            w, x, y, z = 1.0 - th2 / 8.0, g * x - px / 24.0, g * y - py / 24.0, g * z - pz / 24.0
+            a, b, c, d = (
+                a * w - b * x - c * y - d * z,
+                a * x + b * w + c * z - d * y,
+                a * y - b * z + c * w + d * x,
+                a * z + b * y - c * x + d * w,
+            )
+            g = 1.0 / math.sqrt(a * a + b * b + c * c + d * d)
+            a, b, c, d = g * a, g * b, g * c, g * d
+            time += t
+            sin_lat, cos_lat = near_latitude(math.sqrt(rx * rx + ry * ry), rz, sin_lat, cos_lat)
+        _answer(
+            RATE * time,
+            rx,
+            ry,
+            rz,
+            vx + RATE * ry,
+            vy - RATE * rx,
+            vz,
+            a,
+            b,
+            c,
+            d,
+            sin_lat,
+            cos_lat,
+            k,
+            position,
+            velocity,
+            attitude,
+        )
+    state[0], state[1], state[2] = rx, ry, rz
+    state[3], state[4], state[5] = vx, vy, vz
+    state[6], state[7], state[8], state[9] = a, b, c, d
+    state[_LAT], state[_LAT + 1], state[_TIME] = sin_lat, cos_lat, time
+    return len(step)

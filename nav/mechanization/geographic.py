@@ -73,7 +73,7 @@ def advance(
     a, b, c, d = state[6], state[7], state[8], state[9]
     lat_low, lon_low = state[10], state[11]
     a_low, b_low, c_low, d_low = state[12], state[13], state[14], state[15]
-    done = step.shape[0]
+    done = len(step)
     for k in range(step.shape[0]):
         t = step[k]
         sin_lat, cos_lat = math.sin(lat), math.cos(lat)

@@ -41,9 +41,7 @@ def start(
 
 
 @inline_kernel
-def _field(
-    field: int, kx: float, ky: float, kz: float, height: float, prime: float
-) -> tuple[float, float, float]:
+def _field(field: int, kx: float, ky: float, kz: float, height: float, prime: float) -> tuple[float, float, float]:
     """Gravitation in w axes."""
     c = math.sqrt(kx * kx + ky * ky)
     north, down = gravitation_local(field, kz, c, height, (prime + height) * c)
@@ -208,4 +206,4 @@ def advance(
     state[8], state[9], state[10], state[11] = a, b, c, d
     state[12], state[13], state[14], state[15] = ea_low, eb_low, ec_low, ed_low
     state[16], state[17], state[18], state[19] = a_low, b_low, c_low, d_low
-    return step.shape[0]
+    return len(step)

@@ -1,0 +1,324 @@
+"""The command line: what is refused and how, exit codes, what stands on which stream."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.can.convert import to_message
+from drivers.can.dtg_head_emulator import HeadEncoder
+from drivers.can.frames import FrameArray
+from hil import cli
+
+Cli = Callable[..., tuple[int, str, str]]
+HIL = (sys.executable, "-c", "from hil.cli import main; main()")
+COMMANDS = ("run", "imu", "replay", "navigate", "decode", "record", "doctor", "bench", "version")
+
+
+@pytest.fixture
+def hil(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Cli]:
+    """``hil ARGUMENT...`` in this process: (exit code, standard output, standard error)."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["hil", *map(str, arguments)])
+        capsys.readouterr()
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    yield call
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def a_head(samples: int) -> FrameArray:
+    """Slow frames and samples of a head at rest."""
+    encoder, counter = HeadEncoder("fd", 1000, serial=5), np.arange(samples)
+    data = encoder.samples(
+        counter, (counter + 1) * 1000, np.zeros((samples, 4)), np.full((samples, 3), (0, 0, -9.8e-3))
+    )
+    frames: FrameArray = np.concatenate([encoder.slow(), data])
+    frames["time_ns"] = 1_700_000_000_000_000_000 + np.arange(len(frames)) * 1_000_000
+    return frames
+
+
+def write_candump(path: Path, frames: FrameArray) -> Path:
+    import can
+
+    with can.CanutilsLogWriter(path) as log:
+        for row in frames:
+            log.on_message_received(to_message(row, "can0"))
+    return path
+
+
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_on_every_level(hil: Cli, command: str) -> None:
+    code, out, err = hil(*command.split(), "--help")
+    assert code == 0
+    assert "Usage" in out
+    assert not err
+    if not command:
+        assert all(name in out for name in COMMANDS)
+
+
+def test_commands_start_fast() -> None:
+    """Help and wrong requests do not pay for numba."""
+    code = "import sys, hil.cli; print([m for m in ('numba', 'numpy', 'can', 'pydantic', 'pymavlink') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+BAD_TOML = "[navigation\nalign_s = 3"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "toml", "says"),
+    [
+        (["run", "FILE"], "[navigation]\nalign = 15", "navigation.align = 15: unknown key"),
+        (["run", "FILE"], '[head]\nrate_hz = "fast"', "head.rate_hz = 'fast'"),
+        (
+            ["run", "FILE"],
+            "[head]\nrate_hz = 700",
+            "head.rate_hz = 700: Value error, the sample period must be a whole number",
+        ),
+        (["run", "FILE"], "[motion]\nrest_s = 5", "rest_s > 0 needs ramp_s > 0"),
+        (["run", "FILE"], BAD_TOML, "not TOML"),
+        (["run", "FILE"], "\xff\xfe", "not a text file"),
+        (
+            ["imu", "no-such"],
+            "",
+            "scenario no-such: No such file or directory; give a TOML file or one of: coning, default",
+        ),
+        (["run", "--speed", "3"], "", "--speed 3: expected 1 or max"),
+        (["run", "--speed", "max", "--bus", "unix:a"], "", "--speed max needs the simulated head of `hil run`"),
+        (["run", "--assert", "fast"], "", "expected KEY OP NUMBER"),
+        (["run", "--assert", "lost < few"], "", "'few' is not a number"),
+        (["run", "--junit", "x.xml"], "", "--junit needs at least one --assert"),
+        (["run", "--seed", "-1"], "", "--seed"),
+        (["run", "--duration", "0"], "", "duration_s = 0.0"),
+        (["run", "--imu", "no-board"], "", "no driver 'no-board'; there is: dtg-head"),
+        (["run", "--bus", "can0"], "", "bus 'can0': expected INTERFACE:CHANNEL"),
+        (["run", "--bus", "unix:a b"], "", "a bus name has 1 to 40 letters"),
+        (["run", "--bus", "carrier-pigeon:1"], "", "bus carrier-pigeon:1: "),
+        (["run", "--mavlink", "pigeon:14550"], "", "pigeon:14550"),
+        (["imu", "--bus", "can0"], "", "bus 'can0': expected INTERFACE:CHANNEL"),
+        (["replay", "FILE.dhil"], "", "recording FILE.dhil: No such file or directory"),
+        (["record", "--bus", "unix:t-cli", "x.pcap"], "", "endings: .dhil, .log (candump), .blf, .asc"),
+        (["decode", "dtg-head", "no.log"], "", "recording no.log: No such file or directory"),
+        (["decode", "no-board", "no.log"], "", "no driver 'no-board'"),
+        (["navigate", "no.csv", "--init", "no.toml", "--out", "x.csv"], "", "no.csv"),
+        (
+            ["navigate", "no.csv", "--init", "no.toml", "--out", "x.csv", "--gravity", "moon"],
+            "",
+            "unknown gravity 'moon'",
+        ),
+        (["navigate", "no.csv", "--init", "no.toml", "--out", "x.csv", "--attitude", "guess"], "", "guess"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_wrong_request_is_one_line_and_exit_2(
+    hil: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], toml: str, says: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_bytes(toml.encode("latin-1"))
+    code, out, err = hil(*("mine.toml" if argument == "FILE" else argument for argument in arguments))
+    assert code == 2
+    assert out == ""
+    assert says in " ".join(err.replace("│", " ").split())
+    assert "Traceback" not in err
+    assert len([line for line in err.splitlines() if line.startswith("hil: ")]) == (0 if "Usage" in err else 1)
+
+
+def test_several_wrong_keys_are_all_named(hil: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "two.toml"
+    file.write_text('nam = "x"\n[navigation]\nalign_s = 0\n[mavlink]\nsystem_id = 300\n')
+    code, _, err = hil("run", file)
+    assert code == 2
+    lines = err.splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith(f"hil: scenario {file}: ") for line in lines)
+    assert any("nam = 'x': unknown key" in line for line in lines)
+
+
+def test_port_in_use_is_named(hil: Cli) -> None:
+    import socket
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        code, out, err = hil("run", "--duration", "1", "--mavlink", url)
+    assert code == 2
+    assert out == ""
+    assert url in err
+    assert "in use" in err.lower()
+
+
+def test_json_of_a_run_is_one_object_and_nothing_else(hil: Cli) -> None:
+    code, out, err = hil("run", "rest", "--speed", "max", "--duration", "12", "--mavlink", "none", "--json")
+    assert code == 0
+    assert out.count("\n") == 1
+    summary: dict[str, Any] = json.loads(out)
+    assert summary["samples"] == 12000
+    assert summary["lost"] == 0
+    numbers = {"samples", "lost", "duplicated", "crc_errors", "late", "rate_hz"}
+    assert numbers <= {key for key, value in summary.items() if isinstance(value, int | float)}
+    assert set(summary["latency_us"]) == {"p50", "p99", "p999", "max"}
+    assert isinstance(summary["mavlink_sent"], dict)
+    assert "aligning" in err, "events go to standard error"
+    assert "\x1b" not in err, "no colours where there is no terminal"
+
+
+def test_summary_for_people(hil: Cli) -> None:
+    code, out, _ = hil("run", "rest", "--speed", "max", "--duration", "70", "--mavlink", "none")
+    assert code == 0
+    for text in (
+        "mode at the end",
+        "navigate",
+        "70000 in 70.000 s (1000.0 Hz)",
+        "error against the simulated truth",
+        "position_m",
+    ):
+        assert text in out
+
+
+def test_assertions_decide_the_exit_code(hil: Cli, tmp_path: Path) -> None:
+    junit = tmp_path / "hil.xml"
+    wanted = ["lost == 0", "samples > 1e6", "no.such < 1", "mode == align"]
+    arguments = [part for text in wanted for part in ("--assert", text)]
+    code, out, err = hil(
+        *("run", "rest", "--speed", "max", "--duration", "2", "--mavlink", "none", "--json", "--junit", junit),
+        *arguments,
+    )
+    assert code == 1
+    assert json.loads(out)["samples"] == 2000
+    said = [line for line in err.splitlines() if line.startswith("hil: ")]
+    assert said[0] == "hil: assertion failed: samples > 1e6: samples is 2000"
+    assert said[1].startswith("hil: assertion failed: no.such < 1: the summary has no no.such")
+    assert len(said) == 2
+    suite = ET.parse(junit).getroot()
+    assert (suite.get("tests"), suite.get("failures")) == ("4", "2")
+    failed = [case.get("name") for case in suite if case.find("failure") is not None]
+    assert failed == ["samples > 1e6", "no.such < 1"]
+
+
+def test_assertions_that_hold(hil: Cli) -> None:
+    code, _, err = hil("run", "--speed", "max", "--duration", "1", "--mavlink", "none", "--assert", "samples == 1000")
+    assert code == 0
+    assert "assertion" not in err
+
+
+def test_failed_assertion_while_the_request_was_right_is_not_exit_2(hil: Cli, tmp_path: Path) -> None:
+    """Junit into a folder that is not there is a wrong request, said before the run where it can be."""
+    code, _, err = hil(
+        *("run", "--speed", "max", "--duration", "1", "--mavlink", "none", "--assert", "lost == 0"),
+        *("--junit", tmp_path / "no" / "x.xml"),
+    )
+    assert code == 2
+    assert "x.xml: No such file or directory" in err
+
+
+def test_decode(hil: Cli, tmp_path: Path) -> None:
+    log = write_candump(tmp_path / "head.log", a_head(50))
+    code, out, err = hil("decode", "dtg-head", log)
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert code == 0
+    assert len(lines) == 50
+    assert lines[3]["sequence"] == 3
+    assert lines[3]["time"] == pytest.approx(0.004)
+    assert lines[3]["dvel"][2] == pytest.approx(-9.8e-3, abs=2**-26)
+    assert len(lines[3]["dtheta"]) == 4
+    assert lines[3]["rotor"] == [None] * 4
+    counters = json.loads(err)
+    assert counters["samples"] == 50
+    assert counters["frames"] == 55
+    assert counters["crc_errors"] == 0
+
+
+def test_decode_of_a_damaged_file_uses_the_good_part(hil: Cli, tmp_path: Path) -> None:
+    log = write_candump(tmp_path / "head.log", a_head(50))
+    text = log.read_text().splitlines()
+    log.write_text("\n".join([*text[:30], "(not a frame) at all", *text[30:]]))
+    code, out, err = hil("decode", "dtg-head", log)
+    assert code == 1
+    assert len(out.splitlines()) == 25
+    assert "unreadable after frame 30" in err
+    assert "Traceback" not in err
+
+
+def test_decode_into_a_closed_pipe(tmp_path: Path) -> None:
+    log = write_candump(tmp_path / "head.log", a_head(3000))
+    command = [*HIL, "decode", "dtg-head", str(log)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stderr
+        process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == ""
+
+
+@pytest.mark.parametrize(
+    "ending", [".dhil", *(pytest.param(e, marks=pytest.mark.slow) for e in (".log", ".blf", ".asc"))]
+)
+def test_record_writes_what_was_on_the_bus(hil: Cli, tmp_path: Path, ending: str) -> None:
+    file, bus = tmp_path / f"bus{ending}", f"unix:t-record{ending}"
+    head = subprocess.Popen(
+        [*HIL, "imu", "--bus", bus, "--duration", "1", "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert head.stderr
+    head.stderr.readline()  # it says what it is before it computes
+    code, out, _ = hil("record", "--bus", bus, "--duration", "2.5", file, "--json")
+    sent = json.loads(head.communicate()[0])
+    assert code == 0
+    assert json.loads(out)["frames"] == sent["sent"] + 5
+    assert sent == {"scenario": "default", "sent": 1000, "dropped": 0}
+    code, out, err = hil("decode", "dtg-head", file)
+    assert code == 0
+    assert len(out.splitlines()) == 1000
+    assert json.loads(err)["crc_errors"] == 0
+
+
+def test_doctor(hil: Cli) -> None:
+    code, out, err = hil("doctor", "--json")
+    assert code == 0
+    assert not err
+    findings = json.loads(out)["findings"]
+    assert {"ok", "lack", "info"} >= {finding["verdict"] for finding in findings}
+    assert all(finding["mend"] for finding in findings if finding["verdict"] == "lack")
+    assert any("CAN" in finding["what"] for finding in findings)
+
+
+def test_version(hil: Cli) -> None:
+    code, out, _ = hil("version")
+    assert code == 0
+    assert out.startswith("dtg-hil ")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+def test_stop_signal_ends_with_the_summary(number: int) -> None:
+    command = [*HIL, "run", "--mavlink", "none", "--json"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "NO_COLOR": "1"}
+    ) as process:
+        assert process.stderr
+        for line in process.stderr:
+            if "aligning" in line:
+                break
+        process.send_signal(number)
+        out, err = process.communicate(timeout=30)
+    assert process.returncode == 0, err
+    assert json.loads(out)["samples"] > 0
