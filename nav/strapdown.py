@@ -16,7 +16,12 @@ from nav.increments import FloatArray
 from nav.mechanization import cartesian, geographic, wander
 
 MECHANIZATIONS = ("geographic", "wander", "earth", "inertial", "inertial-source")
-ATTITUDES = ("two-sample", "high-order:N", *attitudes.NAMES)
+ATTITUDES = (
+    "two-sample",
+    f"high-order[:N] (N = 3..{MAX_WINDOW})",
+    *(name for name in attitudes.NAMES if name != "two-sample" and not name.startswith("high-order[")),
+)
+"""What there is, for messages and help."""
 
 
 class Strapdown:
@@ -50,10 +55,12 @@ class Strapdown:
     ) -> None:
         if mechanization not in MECHANIZATIONS:
             raise HilError(f"unknown mechanization {mechanization!r}; there is: {', '.join(MECHANIZATIONS)}")
+        if mechanization == "inertial-source" and attitude != "two-sample":
+            raise HilError(f"mechanization 'inertial-source' has its own attitude: it takes no {attitude!r}")
         self._mechanization = mechanization
         self._field = field_code(gravity)
         self._window = _window(attitude)
-        self._method = None if self._window else attitudes.method(attitude)
+        self._method = None if self._window else _method(attitude)
         self._whole = whole_record
         self._room(256)
         self.start(0.0, 0.0, 0.0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -162,6 +169,14 @@ def _turns(before: FloatArray, after: FloatArray) -> FloatArray:
     s2 = np.einsum("ij,ij->i", vector, vector)
     less = -s2 / (1.0 + np.sqrt(np.maximum(0.0, 1.0 - s2)))
     return np.column_stack([less, vector])
+
+
+def _method(attitude: str) -> attitudes.AttitudeMethod:
+    """A method of `nav.attitude`; the refusal lists what there is here."""
+    try:
+        return attitudes.method(attitude)
+    except HilError as refusal:
+        raise HilError(str(refusal).replace(", ".join(attitudes.NAMES), ", ".join(ATTITUDES))) from None
 
 
 def _window(attitude: str) -> int:
