@@ -7,7 +7,7 @@ from typing import Any
 from hil.study.report import Study, write
 from nav.errors import HilError
 
-_MODULES = {"orientation": "hil.study.orientation"}
+_MODULES = {"orientation": "hil.study.orientation", "navigation": "hil.study.navigation"}
 """Studies by name: modules with a function ``run() -> Study``."""
 
 
