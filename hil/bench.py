@@ -41,7 +41,7 @@ def measure(say: Callable[[str], None]) -> list[Row]:
 
     `ratio_to_c` is our time over that of the same arithmetic in C, where there is such a reference and a C compiler.
     """
-    say("compiling and measuring, about a minute")
+    say("compiling and measuring, about half a minute")
     scenario = load("flight").with_changes(navigation={"alignment": "truth"}, bus="unix:none")
     head = SimulatedHead(scenario)
     chunks = list(head.chunks(SAMPLES))
@@ -187,7 +187,7 @@ def _strapdown() -> list[Row]:
         ratio = statistics.median([a / b for a, b in zip(ours, c_times, strict=True)]) if same and c_times else None
         rows.append(
             _row(
-                f"strapdown-{attitude}-{mechanization}",
+                f"strapdown-{2 if attitude == 'two-sample' else 4}-{mechanization}",
                 f"strapdown, batch: {attitude}, {mechanization}",
                 statistics.median(ours),
                 "pyins" if same and peer_ns is not None else "",

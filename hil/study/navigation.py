@@ -201,6 +201,10 @@ def _source() -> tuple[list[Row], list[Plot]]:
             published = PUBLISHED_M[step_ms]
             what = f"the same beside the source's figure: {published / ours:.0f} times ours; its flight is not given"
             rows.append(shown(f"source-published-{step_ms}ms", what, ours, "m", published=published))
+    agile = fly(flight("agile"), 0.005, {"": Strapdown(mechanization="inertial-source")})[1][""].max()
+    lag_agile = 0.005 * gravity_lag(flight("agile"))[1].max()
+    what = "agile flight, 5 ms: inertial-source (reference: from the lag of gravity)"
+    rows.append(shown("source-agile-5ms", what, agile, "m", reference=lag_agile))
     slope = np.polyfit(np.log(SOURCE_STEPS_MS), np.log(largest), 1)[0]
     rows.append(near("source-order", "inertial-source: order in the step", slope, "1", 0.1, published=1.0))
     lines.append(Line("10 ms, from the lag of gravity", lag_time, 0.01 * lag, "--"))
@@ -285,18 +289,10 @@ def _azimuth() -> tuple[list[Row], list[Plot]]:
     what = "agile flight, 240 s: A of the wander mechanization (reference: A' = L' sin B along its path)"
     expected = azimuth_change(lat, lon)[-1]
     rows.append(near("wander-azimuth", what, core.azimuth, "rad", 1e-10, reference=expected))
-    return rows, [
-        Plot(
-            "strip",
-            "Wander azimuth on the planned line and on the way round the strip",
-            "share of the way",
-            "A, deg",
-            [
-                Line("planned line", np.linspace(0.0, 1.0, len(on_planned)), np.degrees(on_planned)),
-                Line("5 km to the left", np.linspace(0.0, 1.0, len(on_other)), np.degrees(on_other)),
-            ],
-        )
-    ]
+    count = len(planned)
+    apart = (on_other[count : 2 * count] - on_planned) / ARCMIN
+    title = "A on the line 5 km to the left less A on the planned line"
+    return rows, [Plot("strip", title, "km", "arc minutes", [Line("", np.linspace(0.0, 5e3, count), apart)])]
 
 
 def _against_geodesic(start: tuple[float, float, float], length: float, path: FloatArray) -> list[Row]:
