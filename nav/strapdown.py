@@ -145,7 +145,16 @@ class Strapdown:
         n = len(step)
         out = self._dq[:n], self._dv[:n], self._ds[:n]
         if self._whole and self._window > 2:
-            integrate_blocks(self._window, step, dtheta, dvel, gyro_bias, *out)
+            moving = step > 0.0  # steps of zero have no place in a polynomial
+            if moving.all():
+                integrate_blocks(self._window, step, dtheta, dvel, gyro_bias, *out)
+                return
+            some = tuple(np.zeros((int(moving.sum()), array.shape[1])) for array in out)
+            if moving.any():
+                integrate_blocks(self._window, step[moving], dtheta[moving], dvel[moving], gyro_bias, *some)
+            for array, part in zip(out, some, strict=True):
+                array[:] = 0.0
+                array[moving] = part
             return
         integrate_body(self._memory, self._window or 2, step, dtheta, dvel, gyro_bias, *out)
         if self._stream is not None:

@@ -197,6 +197,27 @@ def test_how_a_stream_is_split_does_not_matter(mechanization, attitude, gravity,
     assert whole.azimuth == split.azimuth
 
 
+@pytest.mark.parametrize("mechanization", MECHANIZATIONS)
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4", "coning:3"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_steps_of_zero_change_nothing(mechanization, attitude, whole):
+    attitude = "two-sample" if mechanization == "inertial-source" else attitude
+    step, dtheta, dvel = increments(MOTIONS["agile"], 2.0, 0.01)
+    plain, padded, idle = (Strapdown(attitude, mechanization, whole_record=whole) for _ in range(3))
+    for core in plain, padded, idle:
+        begin(core, MOTIONS["agile"].truth([0.0])[0])
+    _, *expected = advance(plain, step, dtheta, dvel)
+    longer = np.stack([np.zeros(200), step], axis=1).ravel()
+    _, *got = advance(padded, longer, dtheta.repeat(2, 0), dvel.repeat(2, 0))
+    for one, other in zip(expected, got, strict=True):
+        np.testing.assert_array_equal(one, other[1::2])
+    before = idle.solution.copy()
+    advance(idle, np.zeros(5), dtheta[:5], dvel[:5])
+    height = 2  # comes from Earth-centred coordinates: their rounding
+    assert idle.solution[height] == pytest.approx(before[height], abs=4e-9)
+    np.testing.assert_allclose(np.delete(idle.solution, height), np.delete(before, height), rtol=1e-14, atol=1e-12)
+
+
 # Symmetries
 
 
