@@ -3,10 +3,17 @@
 Every figure is the median of repeated measurements of the same work; a part and its peer are measured in turns.
 """
 
+import ctypes
+import shutil
 import statistics
+import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
+from importlib.resources import as_file, files
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +23,24 @@ from drivers.can.dtg_head import DtgHead, head_database_text
 from hil.bridge import Loop, LoopOrder, Outlets
 from hil.scenario import load
 from hil.world.head import SimulatedHead
-from nav.increments import ImuIncrements
+from hil.world.motion import Motion
+from nav.increments import FloatArray, ImuIncrements
+from nav.mechanization import geographic
 from nav.navigator import Navigator, Settings
+from nav.rotation import euler_angles
+from nav.strapdown import Strapdown
 
 REPEATS = 9
 SAMPLES = 20_000
+STRAPDOWN_SAMPLES, STRAPDOWN_STEP_S = 200_000, 0.005
 Row = dict[str, Any]
 
 
 def measure(say: Callable[[str], None]) -> list[Row]:
-    """Rows ``{"id", "what", "ns", "ratio_to_c", "peer", "peer_ns"}``, ns a sample or a frame."""
+    """Rows ``{"id", "what", "ns", "ratio_to_c", "peer", "peer_ns"}``, ns a sample or a frame.
+
+    `ratio_to_c` is our time over that of the same arithmetic in C, where there is such a reference and a C compiler.
+    """
     say("compiling and measuring, about half a minute")
     scenario = load("flight").with_changes(navigation={"alignment": "truth"}, bus="unix:none")
     head = SimulatedHead(scenario)
@@ -35,23 +50,33 @@ def measure(say: Callable[[str], None]) -> list[Row]:
         *_simulation(head),
         *_driver(slow, batch),
         *_codec(batch),
+        *_strapdown(),
         *_navigation(slow, batch),
         *_loop(scenario, slow, batch),
     ]
 
 
-def _row(name: str, what: str, ns: float, peer: str = "", peer_ns: float | None = None) -> Row:
-    return {"id": name, "what": what, "ns": ns, "ratio_to_c": None, "peer": peer, "peer_ns": peer_ns}
+def _row(
+    name: str, what: str, ns: float, peer: str = "", peer_ns: float | None = None, ratio_to_c: float | None = None
+) -> Row:
+    return {"id": name, "what": what, "ns": ns, "ratio_to_c": ratio_to_c, "peer": peer, "peer_ns": peer_ns}
 
 
 def _median_ns(work: Callable[[], object], count: int) -> float:
-    work()
-    times = []
-    for _ in range(REPEATS):
-        began = time.perf_counter_ns()
+    return statistics.median(_times_ns([work], count)[0])
+
+
+def _times_ns(works: list[Callable[[], object]], count: int) -> list[list[float]]:
+    """Times of each work, ns, `REPEATS` of them, taken in turns."""
+    times: list[list[float]] = [[] for _ in works]
+    for work in works:
         work()
-        times.append((time.perf_counter_ns() - began) / count)
-    return statistics.median(times)
+    for _ in range(REPEATS):
+        for work, found in zip(works, times, strict=True):
+            began = time.perf_counter_ns()
+            work()
+            found.append((time.perf_counter_ns() - began) / count)
+    return times
 
 
 def _simulation(head: SimulatedHead) -> list[Row]:
@@ -96,6 +121,105 @@ def _codec(batch: Any) -> list[Row]:
         _row("codec-1024", "decode HEAD_SAMPLE, 17 signals, batch", many, "cantools", peer_ns),
         _row("codec-1", "decode HEAD_SAMPLE, one frame", one, "cantools", peer_ns),
     ]
+
+
+class StrapdownRecord:
+    """Exact increments of the built-in flight, and room for what is made of them."""
+
+    def __init__(self, count: int = STRAPDOWN_SAMPLES) -> None:
+        motion = Motion(load("flight").motion.model_copy(update={"rest_s": 0.0, "ramp_s": 0.0}))
+        truth = motion.truth([0.0])[0]
+        self.start = truth["lat"], truth["lon"], truth["height"], truth["vel_n"], truth["q_nb"]
+        self.step = np.full(count, STRAPDOWN_STEP_S)
+        self.dtheta, self.dvel = np.empty((count, 3)), np.empty((count, 3))
+        motion.increments(0, count, STRAPDOWN_STEP_S, self.dtheta, self.dvel)
+        self.bias = np.zeros(3)
+        self.out = np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 4))
+
+    def by(self, core: Strapdown) -> None:
+        """All of it by a core of ours, answers in `out`."""
+        core.start(*self.start)
+        core.advance(self.step, self.dtheta, self.dvel, self.bias, *self.out)
+
+    def by_c(self, function: Any) -> None:
+        """All of it by the C reference."""
+        arrays: list[FloatArray] = [np.zeros(7), geographic.start(*self.start)]
+        first = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
+        rest = [
+            array.ctypes.data_as(ctypes.c_void_p) for array in (self.step, self.dtheta, self.dvel, self.bias, *self.out)
+        ]
+        function(*first, ctypes.c_long(len(self.step)), *rest)
+
+
+def c_two_sample() -> Any:
+    """The C reference, compiled now with ``cc -O3``; None where there is no compiler."""
+    compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        return None
+    with tempfile.TemporaryDirectory() as folder, as_file(files("hil") / "c" / "two_sample.c") as source:
+        library = Path(folder) / "two_sample.so"
+        built = subprocess.run(
+            [compiler, "-O3", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"],
+            capture_output=True,
+            check=False,
+        )
+        if built.returncode:
+            return None
+        function = ctypes.CDLL(str(library)).two_sample
+    function.restype = ctypes.c_long
+    return function
+
+
+def _strapdown() -> list[Row]:
+    record = StrapdownRecord()
+    count = len(record.step)
+    names = [(a, m) for a in ("two-sample", "high-order:4") for m in ("geographic", "earth", "wander", "inertial")]
+    works: list[Callable[[], object]] = [partial(record.by, Strapdown(a, m, whole_record=True)) for a, m in names]
+    function = c_two_sample()
+    if function is not None:
+        works.insert(1, partial(record.by_c, function))  # right after what it is compared with
+    times = _times_ns(works, count)
+    c_times = times.pop(1) if function is not None else None
+    peer_ns = _pyins_ns(record)
+    rows = []
+    for (attitude, mechanization), ours in zip(names, times, strict=True):
+        same = (attitude, mechanization) == names[0]
+        ratio = statistics.median([a / b for a, b in zip(ours, c_times, strict=True)]) if same and c_times else None
+        rows.append(
+            _row(
+                f"strapdown-{2 if attitude == 'two-sample' else 4}-{mechanization}",
+                f"strapdown, batch: {attitude}, {mechanization}",
+                statistics.median(ours),
+                "pyins" if same and peer_ns is not None else "",
+                peer_ns if same else None,
+                ratio,
+            )
+        )
+    if c_times is not None:
+        rows.append(_row("strapdown-c", "the first of these in C, cc -O3", statistics.median(c_times), ratio_to_c=1.0))
+    return rows
+
+
+def _pyins_ns(record: StrapdownRecord) -> float | None:
+    """The peer, with its increments and its integration; None where it is not installed."""
+    try:
+        pandas: Any = import_module("pandas")
+        strapdown: Any = import_module("pyins.strapdown")
+        util: Any = import_module("pyins.util")
+    except ImportError:
+        return None
+    lat, lon, height, vel_n, q = record.start
+    angles = np.degrees(euler_angles(np.asarray(q)[None])[0])
+    place = [np.degrees(lat), np.degrees(lon), height, *vel_n, angles[2], angles[1], angles[0]]
+    start = pandas.Series(place, index=util.TRAJECTORY_COLS, name=0.0)
+    index = pandas.Index(np.cumsum(record.step), name="time")
+    columns = [*util.GYRO_COLS, *util.ACCEL_COLS]
+    imu = pandas.DataFrame(np.hstack([record.dtheta, record.dvel]), index=index, columns=columns)
+
+    def work() -> None:
+        strapdown.Integrator(start).integrate(strapdown.compute_increments_from_imu(imu, "increment"))
+
+    return _median_ns(work, len(record.step))
 
 
 def _navigation(slow: Any, batch: Any) -> list[Row]:

@@ -110,6 +110,7 @@ def settings_of(scenario: Scenario) -> Settings:
         position_trusted=navigation.alignment != "level",
         attitude=navigation.attitude,
         mechanization=navigation.mechanization,
+        gravity=navigation.gravity,
         lever_arm=scenario.head.lever_arm_m,
         gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
     )

@@ -155,14 +155,12 @@ def navigate(
     """Navigate logged increments offline."""
     from hil.offline import IMU_HEADER, NAV_HEADER, read_start, read_table, thin, write_table
     from hil.offline import navigate as navigate_rows
-    from nav.mechanization import check_choice
+    from nav.strapdown import Strapdown
 
-    check_choice(attitude, mechanization)
-    if gravity != "normal":
-        raise HilError(f"unknown gravity {gravity!r}; there is: normal")
+    Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
     table, start = read_table(imu_file, IMU_HEADER), read_start(init)
     began = time.perf_counter()
-    rows = navigate_rows(table, start, attitude, mechanization)
+    rows = navigate_rows(table, start, attitude, mechanization, gravity)
     seconds = time.perf_counter() - began
     if every:
         rows = thin(rows, every)
@@ -226,6 +224,32 @@ def doctor(as_json: Json = False) -> None:
         words = (escape(text) for text in (finding.what, finding.found, finding.mend))
         table.add_row(f"[{colours[finding.verdict]}]{finding.verdict}[/]", *words)
     Console(highlight=False).print(table)
+
+
+@app.command()
+def study(
+    names: Annotated[list[str], typer.Argument(help="Names of studies, or all.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the report (HTML, SVG, JSON).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Reproduce the published tables and figures beside our own; exit code 1 when a limit is not kept."""
+    from hil.study import study as run_study
+    from hil.study import study_names
+
+    failed = []
+    for name in study_names() if names == ["all"] else names:
+        rows = run_study(name, out)
+        failed += [f"{name}: {row['id']}" for row in rows if not row["ok"]]
+        if as_json:
+            print(json.dumps({"study": name, "rows": rows}))
+            continue
+        for row in rows:
+            mark = "  " if row["ok"] else "! "
+            print(
+                f"{mark}{row['id']:34} published {row['published']!s:>10}  ours {row['ours']!s:>24} {row['unit']}  {row['what']}"
+            )
+    if failed:
+        raise RunFailed("not within its limit: " + ", ".join(failed))
 
 
 @app.command()

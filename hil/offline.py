@@ -7,12 +7,11 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nav.errors import HilError
-from nav.increments import FloatArray, ImuIncrements
-from nav.navigator import Navigator, Settings
+from nav.increments import FloatArray
 from nav.rotation import euler_angles, quaternion_from_euler
+from nav.strapdown import Strapdown
 
 IMU_HEADER = ("time_s", "dtheta_x", "dtheta_y", "dtheta_z", "dvel_x", "dvel_y", "dvel_z")
 NAV_HEADER = (
@@ -140,7 +139,9 @@ def read_start(path: Path) -> dict[str, float]:
     return start
 
 
-def navigate(table: FloatArray, start: dict[str, float], attitude: str, mechanization: str) -> FloatArray:
+def navigate(
+    table: FloatArray, start: dict[str, float], attitude: str, mechanization: str, gravity: str = "normal"
+) -> FloatArray:
     """Navigation rows (n, 10: `NAV_HEADER`) of IMU rows (n, 7: `IMU_HEADER`) from `start`.
 
     Raises
@@ -155,31 +156,26 @@ def navigate(table: FloatArray, start: dict[str, float], attitude: str, mechaniz
         k = int(wrong[0])
         before = start["time_s"] if k == 0 else float(time[k - 1])
         raise HilError(f"row {k + 1}: time_s = {float(time[k])} does not come after {before}")
-    navigator = Navigator(Settings(attitude=attitude, mechanization=mechanization))
-    navigator.begin(
+    core = Strapdown(attitude, mechanization, gravity, whole_record=True)
+    core.start(
         math.radians(start["lat_deg"]),
         math.radians(start["lon_deg"]),
         start["height_m"],
         np.array([start["vel_north"], start["vel_east"], start["vel_down"]]),
         quaternion_from_euler(*np.radians([start["heading_deg"], start["pitch_deg"], start["roll_deg"]])),
-        start["time_s"],
     )
     n = len(table)
-    imu = ImuIncrements(
-        np.ascontiguousarray(time),
-        step,
-        np.ascontiguousarray(table[:, 1:4]),
-        np.ascontiguousarray(table[:, 4:7]),
-        np.zeros(n, np.int64),
-        np.arange(n),
-    )
-    return _nav_rows(navigator.process(imu))
-
-
-def _nav_rows(rows: NDArray[Any]) -> FloatArray:
-    angles = np.degrees(euler_angles(np.ascontiguousarray(rows["q_nb"])))
-    position = np.stack([np.degrees(rows["lat"]), np.degrees(rows["lon"]), rows["height"]], axis=1)
-    return np.column_stack([rows["time"], position, rows["vel_n"], angles[:, ::-1]])
+    position, velocity, quaternion = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
+    dtheta, dvel = np.ascontiguousarray(table[:, 1:4]), np.ascontiguousarray(table[:, 4:7])
+    done = core.advance(step, dtheta, dvel, np.zeros(3), position, velocity, quaternion)
+    if done < n:
+        raise HilError(
+            f"row {done + 1}: the {mechanization} mechanization is singular at the pole "
+            f"(latitude {math.degrees(core.solution[0]):.4f} deg); use wander, earth or inertial"
+        )
+    angles = np.degrees(euler_angles(quaternion))
+    place = np.column_stack([np.degrees(position[:, :2]), position[:, 2]])
+    return np.column_stack([time, place, velocity, angles[:, ::-1]])
 
 
 def thin(rows: FloatArray, every_s: float) -> FloatArray:

@@ -119,7 +119,7 @@ class NavigationConfig(_Model):
     start: StartConfig = StartConfig()
     attitude: str = "two-sample"
     mechanization: str = "geographic"
-    gravity: Literal["normal"] = "normal"
+    gravity: Literal["normal", "j2"] = "normal"
     gap_interpolate_s: NotNegative = 0.1
     """Gaps up to this length are filled by interpolation; longer ones are bridged and the mode is degraded."""
     gap_realign_s: Positive = 10.0

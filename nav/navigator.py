@@ -18,9 +18,9 @@ from nav.errors import HilError
 from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, Validity
 from nav.lever_arm import shift
-from nav.mechanization import check_choice, geographic
 from nav.rotation import euler_from_quaternion
 from nav.state import NAV_STATE, Health, Mode
+from nav.strapdown import Strapdown
 
 StateArray = NDArray[Any]
 Severity = Literal["info", "notice", "warning", "error"]
@@ -68,6 +68,7 @@ class Settings:
     position_trusted: bool = True
     attitude: str = "two-sample"
     mechanization: str = "geographic"
+    gravity: str = "normal"
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gaps: GapPolicy = field(default_factory=GapPolicy)
 
@@ -91,7 +92,7 @@ class Navigator:
     """
 
     def __init__(self, settings: Settings) -> None:
-        check_choice(settings.attitude, settings.mechanization)
+        self._core = Strapdown(settings.attitude, settings.mechanization, settings.gravity)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -101,7 +102,7 @@ class Navigator:
         self.heading = settings.heading
         self._filler = GapFiller(settings.gaps)
         self._sums = np.zeros(rest.SUMS)
-        self._state = geographic.initial_state(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
+        self._state = _solution(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
         self._arm = np.asarray(settings.lever_arm, float)
         self._progress = 0.0
         self._events: list[Event] = []
@@ -127,8 +128,9 @@ class Navigator:
 
         Position in rad and m, velocity in m/s; the body rate (rad/s) matters with a lever arm only.
         """
-        self._state = geographic.initial_state(lat, lon, height, vel_n, q_nb)
+        self._state = _solution(lat, lon, height, vel_n, q_nb)
         self._move(1.0, w_ib_b)
+        self._start_core()
         self._sums[:] = 0.0
         self._progress = 1.0
         self._say(time, "info", "navigating from a given start")
@@ -143,7 +145,7 @@ class Navigator:
         if self._state[6:10].any():
             self._move(-1.0)
         lat, lon, height = self._state[:3]
-        self._state = geographic.initial_state(lat, lon, height, np.zeros(3), np.zeros(4))
+        self._state = _solution(lat, lon, height, np.zeros(3), np.zeros(4))
         self._say(time, "notice", f"aligning: {reason}")
 
     def silent(self) -> StateArray:
@@ -205,6 +207,10 @@ class Navigator:
         rate = np.zeros((1, 3)) if w_ib_b is None else np.asarray(w_ib_b, float).reshape(1, 3)
         shift(lat, lon, height, vel_n.reshape(1, 3), q_nb.reshape(1, 4), rate, sign * self._arm)
 
+    def _start_core(self) -> None:
+        lat, lon, height = self._state[:3]
+        self._core.start(lat, lon, height, self._state[3:6], self._state[6:10])
+
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):
             size = 2 * n + 1
@@ -265,6 +271,7 @@ class Navigator:
         self._sums[:] = 0.0
         self._state[6:10] = result.q_nb
         self._move(1.0)
+        self._start_core()
         self.mode = Mode.NAVIGATE
         heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(result.q_nb))
         self._say(
@@ -284,8 +291,7 @@ class Navigator:
             stop = start + used
         n = stop - start
         position, velocity, attitude = (array[:n] for array in self._scratch)
-        done = geographic.advance(
-            self._state,
+        done = self._core.advance(
             imu.step[start:stop],
             imu.dtheta[start:stop],
             imu.dvel[start:stop],
@@ -294,6 +300,7 @@ class Navigator:
             velocity,
             attitude,
         )
+        self._state[:] = self._core.solution
         if done < n:
             raise HilError(
                 f"the geographic mechanization is singular at the pole: stopped at latitude "
@@ -354,3 +361,8 @@ class Navigator:
         part["lat"], part["lon"], part["height"] = self._state[0], self._state[1], self._state[2]
         part["vel_n"], part["q_nb"], part["gyro_bias"] = self._state[3:6], self._state[6:10], self.gyro_bias
         part["progress"] = self._progress
+
+
+def _solution(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> FloatArray:
+    """lat, lon, height, vel_n (3), q_nb (4) in one array, as `Strapdown.solution`."""
+    return np.array([lat, lon, height, *vel_n, *q_nb], float)

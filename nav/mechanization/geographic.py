@@ -1,43 +1,32 @@
-"""Level (geographic, north-slaved) mechanization with two-sample coning and sculling.
+"""Level, north-slaved mechanization in curvilinear coordinates: geodetic position, velocity in n, attitude q_nb.
 
-State: geodetic position, velocity in n, attitude q_nb. One step takes the increments of that step and remembers them:
-the previous increments give the slope of rate and specific force inside the step (two-sample algorithm in its
-previous-increment form, exact for a rate and a force that are linear over both steps, unequal steps included).
-The local level turns by its mid-step rate; Coriolis, gravity and the radii are taken at mid-step. Second order in all.
+A step happens in axes that stand still among the stars: those of n at the step's start. There the body integrals (see
+:mod:`nav.body_integrals`) and the gravitation at mid-step add up to the inertial displacement; the Earth's turn is taken
+off it exactly; what is left moves latitude, longitude and height along the chord at the mid latitude; the new n is reached
+by the rotation of latitude and longitude. Every part is exact but for terms of third order in step / Earth radius and in the
+change of gravitation, far below what the sensors' polynomial leaves; so the order is that of the body integrals.
 
-Singular at the poles: `advance` stops before a step that starts within `POLAR_CAP` of one.
+Singular at the poles: stops before a step that starts within `POLAR_CAP` of one.
 """
 
 import math
 
 import numpy as np
 
-from nav.earth import RATE, curvature_radii, normal_gravity
+from nav.body_integrals import change_by_turn, cross, turn_of
+from nav.earth import RATE, curvature_radii
+from nav.gravitation import gravitation_local
 from nav.increments import FloatArray
-from nav.kernel import inline_kernel, kernel
-from nav.rotation import from_rotation_vector, multiply, normalise, rotate
+from nav.kernel import kernel
 
 POLAR_CAP = 1e-3
 """cos(lat) below which the mechanization refuses to go on (6.4 km from the pole)."""
+STATE = 16
+"""lat, lon, height | vel_n (3) | q_nb (4) | what rounding left of lat, lon, q_nb, carried to the next step."""
 
-STATE = 17
-"""lat, lon, height | vel_n (3) | q_nb (4) | previous dtheta (3), dvel (3), step."""
 
-
-def initial_state(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> FloatArray:
-    """State vector (`STATE`,) at a start with no previous increments.
-
-    Parameters
-    ----------
-    lat, lon : float
-        Geodetic position, rad.
-    height : float
-        Above the ellipsoid, m.
-    vel_n : (3,) float
-        North, east, down, m/s.
-    q_nb : (4,) float
-        Attitude.
-    """
+def start(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> FloatArray:
+    """State vector at a geodetic position (rad, m) with velocity (3,), m/s, and attitude (4,)."""
     state = np.zeros(STATE)
     state[0:3] = lat, lon, height
     state[3:6] = vel_n
@@ -45,140 +34,168 @@ def initial_state(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb
     return state
 
 
-@inline_kernel
-def local_rate(sin_lat: float, cos_lat: float, height: float, vel: FloatArray, w: FloatArray) -> None:
-    """w: (6,) = Earth rate w_ie and transport rate w_en in n, rad/s, at a position with velocity `vel` (n)."""
-    meridian, prime = curvature_radii(sin_lat)
-    east = vel[1] / (prime + height)
-    w[0], w[1], w[2] = RATE * cos_lat, 0.0, -RATE * sin_lat
-    w[3], w[4], w[5] = east, -vel[0] / (meridian + height), -east * sin_lat / cos_lat
-
-
 @kernel
 def advance(
     state: FloatArray,
+    field: int,
     step: FloatArray,
-    dtheta: FloatArray,
-    dvel: FloatArray,
-    gyro_bias: FloatArray,
+    dq: FloatArray,
+    dv: FloatArray,
+    ds: FloatArray,
     position: FloatArray,
     velocity: FloatArray,
     attitude: FloatArray,
 ) -> int:
-    """Integrate a batch of increments.
+    """Take the body integrals of a batch of steps.
 
     Parameters
     ----------
     state : (STATE,) float
         Advanced in place.
+    field : int
+        Gravity field (:mod:`nav.gravitation`).
     step : (n,) float
-        Steps, s; a step of zero leaves the state as it is.
-    dtheta, dvel : (n, 3) float
-        Increments, rad and m/s, body axes.
-    gyro_bias : (3,) float
-        Taken off the rates, rad/s.
+        s; a step of zero changes nothing.
+    dq, dv, ds : (n, 4), (n, 3), (n, 3) float
+        Of :func:`nav.body_integrals.integrate_body`.
     position : (n, 3) float
         Out: lat, lon (rad), height (m) at the end of each step.
-    velocity : (n, 3) float
-        Out: vel_n, m/s.
-    attitude : (n, 4) float
-        Out: q_nb.
+    velocity, attitude : (n, 3), (n, 4) float
+        Out: vel_n (m/s) and q_nb.
 
     Returns
     -------
     int
-        Number of steps done: less than n where the next would start in the polar cap.
+        Steps done: fewer than n where the next would start in the polar cap.
     """
-    q = state[6:10]
-    vel = state[3:6]
-    work = np.empty(24)
-    dth, dv, new, mid, w, delta = work[0:3], work[3:6], work[6:9], work[9:12], work[12:18], work[18:22]
+    lat, lon, height = state[0], state[1], state[2]
+    vn, ve, vd = state[3], state[4], state[5]
+    a, b, c, d = state[6], state[7], state[8], state[9]
+    lat_low, lon_low = state[10], state[11]
+    a_low, b_low, c_low, d_low = state[12], state[13], state[14], state[15]
+    done = len(step)
     for k in range(step.shape[0]):
-        if math.cos(state[0]) < POLAR_CAP:
-            return k
-        dt = step[k]
-        if dt > 0.0:
-            for i in range(3):
-                dth[i] = dtheta[k, i] - gyro_bias[i] * dt
-                dv[i] = dvel[k, i]
-            _step(state, q, vel, dt, dth, dv, new, mid, w, delta)
-        for i in range(3):
-            position[k, i] = state[i]
-            velocity[k, i] = vel[i]
-        for i in range(4):
-            attitude[k, i] = q[i]
-    return len(step)
+        t = step[k]
+        sin_lat, cos_lat = math.sin(lat), math.cos(lat)
+        if cos_lat < POLAR_CAP:
+            done = k
+            break
+        if t > 0.0:
+            # Body integrals in the axes of n at the step's start.
+            x, y, z = dv[k, 0], dv[k, 1], dv[k, 2]
+            px, py, pz = cross(b, c, d, x, y, z)
+            px, py, pz = 2.0 * px, 2.0 * py, 2.0 * pz
+            qx, qy, qz = cross(b, c, d, px, py, pz)
+            un, ue, ud = x + a * px + qx, y + a * py + qy, z + a * pz + qz
+            x, y, z = ds[k, 0], ds[k, 1], ds[k, 2]
+            px, py, pz = cross(b, c, d, x, y, z)
+            px, py, pz = 2.0 * px, 2.0 * py, 2.0 * pz
+            qx, qy, qz = cross(b, c, d, px, py, pz)
+            sn, se, sd = x + a * px + qx, y + a * py + qy, z + a * pz + qz
 
+            meridian, prime = curvature_radii(sin_lat)
+            axis = (prime + height) * cos_lat
+            turn = RATE * t
+            vi = ve + RATE * axis  # inertial velocity to the east
 
-@inline_kernel
-def _step(
-    state: FloatArray,
-    q: FloatArray,
-    vel: FloatArray,
-    dt: float,
-    dth: FloatArray,
-    dv: FloatArray,
-    new: FloatArray,
-    mid: FloatArray,
-    w: FloatArray,
-    delta: FloatArray,
-) -> None:
-    px, py, pz, ux, uy, uz, dt0 = state[10], state[11], state[12], state[13], state[14], state[15], state[16]
-    c = dt * dt / (6.0 * dt0 * (dt + dt0)) if dt0 > 0.0 else 0.0
-    state[10], state[11], state[12], state[13], state[14], state[15] = dth[0], dth[1], dth[2], dv[0], dv[1], dv[2]
-    state[16] = dt
+            # Mid-step place, for gravitation: half of the way, the Earth's turn included.
+            half = 0.5 * t
+            hn, he, hd = half * vn + 0.25 * sn, half * ve + 0.25 * se, half * vd + 0.25 * sd
+            gn0, gd0 = gravitation_local(field, sin_lat, cos_lat, height, axis)
+            dlat = (hn - 0.125 * t * t * sin_lat * vi * vi / axis) / (meridian + height)
+            dlon = he / axis
+            sm = sin_lat + dlat * (cos_lat - 0.5 * dlat * sin_lat)
+            cm = cos_lat - dlat * (sin_lat + 0.5 * dlat * cos_lat)
+            hm = height - hd - 0.125 * t * t * (gd0 - cos_lat * vi * vi / axis - vn * vn / (meridian + height))
+            _, prime_m = curvature_radii(sm)
+            gn, gd = gravitation_local(field, sm, cm, hm, (prime_m + hm) * cm)
+            angle = dlon + 0.5 * turn
+            px, ge, pz = change_by_turn(angle * cos_lat, -dlat, -angle * sin_lat, gn, 0.0, gd)
+            gn, gd = gn + px, gd + pz
 
-    # Velocity increment in the body axes at the step's start: rotation and sculling.
-    hx, hy, hz = 0.5 * dth[0] + c * px, 0.5 * dth[1] + c * py, 0.5 * dth[2] + c * pz
-    mid[0] = dv[0] + hy * dv[2] - hz * dv[1] + c * (uy * dth[2] - uz * dth[1])
-    mid[1] = dv[1] + hz * dv[0] - hx * dv[2] + c * (uz * dth[0] - ux * dth[2])
-    mid[2] = dv[2] + hx * dv[1] - hy * dv[0] + c * (ux * dth[1] - uy * dth[0])
-    rotate(q, mid, new)  # new: the increment in n at the step's start
+            # Inertial velocity gained and displacement; gravitation is linear in time over the step.
+            un, ue, ud = un + gn * t, ue + ge * t, ud + gd * t
+            w = t * t
+            dn = vn * t + sn + w * (0.5 * gn - (gn - gn0) / 6.0)
+            de = vi * t + se + w * (0.5 * ge - ge / 6.0)
+            dd = vd * t + sd + w * (0.5 * gd - (gd - gd0) / 6.0)
+            # Take the Earth's turn about (cos lat, 0, -sin lat) off the new place, seen from the old one.
+            sw = turn - turn * turn * turn / 6.0
+            cw = 0.5 * turn * turn
+            kx = sin_lat * de
+            ky = axis - sin_lat * dn - cos_lat * dd
+            kz = cos_lat * de
+            rn, re, rd = dn - sw * kx, de - sw * ky, dd - sw * kz
+            rn += cw * sin_lat * ky
+            re -= cw * de
+            rd += cw * cos_lat * ky
 
-    lat, height = state[0], state[2]
-    sin_lat, cos_lat = math.sin(lat), math.cos(lat)
-    meridian, prime = curvature_radii(sin_lat)
-    # Mid-step velocity: half of the increment, of gravity and of Coriolis, all as at the step's start.
-    local_rate(sin_lat, cos_lat, height, vel, w)
-    gx, gy, gz = (2.0 * w[0] + w[3]) * dt, (2.0 * w[1] + w[4]) * dt, (2.0 * w[2] + w[5]) * dt
-    gravity = normal_gravity(sin_lat, height)
-    mid[0] = vel[0] + 0.5 * (new[0] - gy * vel[2] + gz * vel[1])
-    mid[1] = vel[1] + 0.5 * (new[1] - gz * vel[0] + gx * vel[2])
-    mid[2] = vel[2] + 0.5 * (new[2] - gx * vel[1] + gy * vel[0] + gravity * dt)
-    mid_height = height - 0.5 * dt * mid[2]
-    mid_lat = lat + 0.5 * dt * mid[0] / (meridian + height)
-    sin_lat, cos_lat = math.sin(mid_lat), math.cos(mid_lat)
-    local_rate(sin_lat, cos_lat, mid_height, mid, w)
-    gravity = normal_gravity(sin_lat, mid_height)
+            # Along the meridian and around the axis.
+            out = -sin_lat * rn - cos_lat * rd
+            radius = axis + out
+            dlon = re / radius
+            dlon -= dlon * dlon * dlon / 3.0
+            bulge = 0.5 * re * re / radius
+            up = cos_lat * bulge - rd
+            north = rn - sin_lat * bulge
+            dlat = north / (meridian + height)
+            h = 0.5 * dlat
+            sm = sin_lat + h * (cos_lat - 0.5 * h * sin_lat)
+            cm = cos_lat - h * (sin_lat + 0.5 * h * cos_lat)
+            meridian, _ = curvature_radii(sm)
+            chord = north - h * (up + 0.5 * h * north)
+            rise = up + h * (north - 0.5 * h * up)
+            dlat = chord / (meridian + height + 0.5 * rise)
 
-    # The level turns by zeta over the step, by half of it on average while the increment comes in.
-    zx, zy, zz = (w[0] + w[3]) * dt, (w[1] + w[4]) * dt, (w[2] + w[5]) * dt
-    gx, gy, gz = 2.0 * w[0] + w[3], 2.0 * w[1] + w[4], 2.0 * w[2] + w[5]
-    ax = new[0] - 0.5 * (zy * new[2] - zz * new[1]) - dt * (gy * mid[2] - gz * mid[1])
-    ay = new[1] - 0.5 * (zz * new[0] - zx * new[2]) - dt * (gz * mid[0] - gx * mid[2])
-    az = new[2] - 0.5 * (zx * new[1] - zy * new[0]) - dt * (gx * mid[1] - gy * mid[0]) + gravity * dt
+            lat_low += dlat
+            low = lat + lat_low
+            lat_low -= low - lat
+            lat = low
+            lon_low += dlon
+            low = lon + lon_low
+            lon_low -= low - lon
+            lon = low
+            if lon > math.pi:
+                lon -= 2.0 * math.pi
+            elif lon < -math.pi:
+                lon += 2.0 * math.pi
+            height += rise
 
-    mid[0], mid[1], mid[2] = vel[0] + 0.5 * ax, vel[1] + 0.5 * ay, vel[2] + 0.5 * az
-    meridian, prime = curvature_radii(sin_lat)
-    state[0] = lat + dt * mid[0] / (meridian + mid_height)
-    state[1] += dt * mid[1] / ((prime + mid_height) * cos_lat)
-    state[2] = height - dt * mid[2]
-    if state[1] > math.pi:
-        state[1] -= 2.0 * math.pi
-    elif state[1] < -math.pi:
-        state[1] += 2.0 * math.pi
-    vel[0] += ax
-    vel[1] += ay
-    vel[2] += az
-
-    # Attitude: body turns by the coning-corrected rotation vector, the level by zeta.
-    from_rotation_vector(
-        dth[0] + c * (py * dth[2] - pz * dth[1]),
-        dth[1] + c * (pz * dth[0] - px * dth[2]),
-        dth[2] + c * (px * dth[1] - py * dth[0]),
-        delta,
-    )
-    multiply(q, delta, q)
-    from_rotation_vector(-zx, -zy, -zz, delta)
-    multiply(delta, q, q)
-    normalise(q)
+            # From the old level to the new one.
+            angle = dlon + turn
+            zx, zy, zz = angle * cm, -dlat, -angle * sm
+            px, py, pz = change_by_turn(-zx, -zy, -zz, vn + un, vi + ue, vd + ud)
+            vn, ve, vd = vn + (un + px), ve + (ue + py - RATE * (out + bulge)), vd + (ud + pz)
+            w, x, y, z = dq[k, 0], dq[k, 1], dq[k, 2], dq[k, 3]
+            e = a * w - b * x - c * y - d * z
+            f = a * x + b * w + c * z - d * y
+            g = a * y - b * z + c * w + d * x
+            h = a * z + b * y - c * x + d * w
+            w, x, y, z = turn_of(-zx, -zy, -zz)
+            px, py, pz, qx = a + e, b + f, c + g, d + h
+            lack = 0.5 - 0.5 * (a * a + b * b + c * c + d * d)
+            a_low += e + (w * px - x * py - y * pz - z * qx) + lack * a
+            b_low += f + (w * py + x * px + y * qx - z * pz) + lack * b
+            c_low += g + (w * pz - x * qx + y * px + z * py) + lack * c
+            d_low += h + (w * qx + x * pz - y * py + z * px) + lack * d
+            low = a + a_low
+            a_low -= low - a
+            a = low
+            low = b + b_low
+            b_low -= low - b
+            b = low
+            low = c + c_low
+            c_low -= low - c
+            c = low
+            low = d + d_low
+            d_low -= low - d
+            d = low
+        position[k, 0], position[k, 1], position[k, 2] = lat, lon, height
+        velocity[k, 0], velocity[k, 1], velocity[k, 2] = vn, ve, vd
+        attitude[k, 0], attitude[k, 1], attitude[k, 2], attitude[k, 3] = a, b, c, d
+    state[0], state[1], state[2] = lat, lon, height
+    state[3], state[4], state[5] = vn, ve, vd
+    state[6], state[7], state[8], state[9] = a, b, c, d
+    state[10], state[11] = lat_low, lon_low
+    state[12], state[13], state[14], state[15] = a_low, b_low, c_low, d_low
+    return done

@@ -45,10 +45,18 @@ def test_the_header_of_the_solution():
     )
 
 
-def test_the_flight_is_navigated(flight, tmp_path):
+@pytest.mark.parametrize(
+    ("attitude", "mechanization"),
+    [
+        *[("two-sample", name) for name in ("geographic", "wander", "earth", "inertial")],
+        ("high-order:6", "geographic"),
+        ("picard3", "wander"),
+    ],
+)
+def test_the_flight_is_navigated(flight, tmp_path, attitude, mechanization):
     motion, table = flight
     write_table(tmp_path / "imu.csv", IMU_HEADER, table)
-    rows = navigate(read_table(tmp_path / "imu.csv", IMU_HEADER), start_of(motion, START), "two-sample", "geographic")
+    rows = navigate(read_table(tmp_path / "imu.csv", IMU_HEADER), start_of(motion, START), attitude, mechanization)
     truth = motion.truth(table[:, 0])
     assert rows.shape == (6000, 10)
     np.testing.assert_array_equal(rows[:, 0], table[:, 0])
@@ -122,6 +130,16 @@ def test_time_that_does_not_increase_is_named(row):
         navigate(table, start, "two-sample", "geographic")
     with pytest.raises(HilError, match="there is: two-sample"):
         navigate(ROWS, start, "three-sample", "geographic")
+
+
+def test_the_pole_is_refused_with_its_row_and_what_to_use():
+    table = np.column_stack([np.arange(1.0, 4001.0), np.zeros((4000, 5)), np.full(4000, -9.832)])
+    start = dict.fromkeys(NAV_HEADER, 0.0) | {"lat_deg": 89.9, "vel_north": 50.0}
+    with pytest.raises(
+        HilError, match=r"row \d+: the geographic .* singular at the pole .*; use wander, earth or inertial"
+    ):
+        navigate(table, start, "two-sample", "geographic")
+    assert np.isfinite(navigate(table, start, "two-sample", "wander")).all()
 
 
 GOOD = "\n".join(f"{name} = {k}" for k, name in enumerate(NAV_HEADER))

@@ -1,0 +1,566 @@
+"""Every mechanization against the same analytic flights, against each other, and where they differ: poles and azimuth."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pymap3d
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hil.scenario import MotionConfig, load
+from hil.world.motion import Motion
+from nav.earth import E2, GM, J2, RATE, A, curvature_radii, normal_gravity
+from nav.errors import HilError
+from nav.gravitation import J2_FIELD, NORMAL, gravitation_cartesian, gravitation_local, near_latitude
+from nav.increments import ImuIncrements
+from nav.mechanization import wander
+from nav.navigator import Navigator, Settings
+from nav.rotation import attitude_error
+from nav.strapdown import MECHANIZATIONS, Strapdown
+
+EXACT = ("geographic", "wander", "earth", "inertial")
+EVERYWHERE = ("wander", "earth", "inertial")
+"""Without a singular place."""
+FLIGHT = load("flight").motion.model_copy(update={"rest_s": 0.0, "ramp_s": 0.0})
+AGILE = MotionConfig.model_validate(
+    FLIGHT.model_dump()
+    | {
+        "roll": {
+            "sines": [{"amplitude": 30, "period_s": 35}, {"amplitude": 2, "period_s": 1.0, "phase_deg": 20}],
+        },
+        "pitch": {"sines": [{"amplitude": 1, "period_s": 1.3, "phase_deg": 50}]},
+        "heading": {"sines": [{"amplitude": 1.5, "period_s": 2.0, "phase_deg": 110}]},
+    }
+)
+"""The flight with banking to and fro and with vibration of 0.5 to 1 Hz."""
+MOTIONS = {"flight": Motion(FLIGHT), "agile": Motion(AGILE)}
+ATTITUDES = ("two-sample", "high-order:4", "high-order:6", "picard3", "four-sample", "coning:3", "high-order-stream:5")
+
+
+def increments(motion, duration, step, start=0.0):
+    n = round(duration / step)
+    dtheta, dvel = np.empty((n, 3)), np.empty((n, 3))
+    motion.increments(round(start / step), n, step, dtheta, dvel)
+    return np.full(n, step), dtheta, dvel
+
+
+def begin(core, row, turn=0.0):
+    core.start(row["lat"], row["lon"] + turn, row["height"], row["vel_n"], row["q_nb"])
+
+
+def advance(core, step, dtheta, dvel):
+    n = len(step)
+    out = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 4), np.nan)
+    done = core.advance(step, np.ascontiguousarray(dtheta), np.ascontiguousarray(dvel), np.zeros(3), *out)
+    return done, *out
+
+
+def fly(motion, core, duration, step):
+    """Positions (n, 3), velocities, attitudes at the ends of the steps."""
+    begin(core, motion.truth([0.0])[0])
+    done, *out = advance(core, *increments(motion, duration, step))
+    assert done == len(out[0])
+    return out
+
+
+def cartesian(position):
+    return np.stack(pymap3d.geodetic2ecef(*np.asarray(position).T, deg=False), axis=-1)
+
+
+def way_off(motion, position, step):
+    """Distances from the truth, m."""
+    truth = motion.truth(step * np.arange(1, len(position) + 1))
+    right = cartesian(np.stack([truth["lat"], truth["lon"], truth["height"]], axis=1))
+    return np.linalg.norm(cartesian(position) - right, axis=1)
+
+
+# Flights
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+@pytest.mark.parametrize("name", MOTIONS)
+@pytest.mark.parametrize(
+    ("attitude", "limit"),
+    [("two-sample", {"flight": 1e-6, "agile": 2e-3}), ("high-order:4", dict.fromkeys(MOTIONS, 5e-7))],
+)
+def test_flights_in_every_mechanization(mechanization, name, attitude, limit):
+    """250 s at 100 Hz. Required: 1e-2 m with two samples, 1e-5 m with four."""
+    motion = MOTIONS[name]
+    position, velocity, q_nb = fly(motion, Strapdown(attitude, mechanization, whole_record=True), 250.0, 0.01)
+    truth = motion.truth(0.01 * np.arange(1, 25_001))
+    assert way_off(motion, position, 0.01).max() < limit[name]
+    assert np.abs(velocity - truth["vel_n"]).max() < limit[name] / 10.0
+    assert np.abs(attitude_error(q_nb[-1], truth["q_nb"][-1])).max() < limit[name] / 100.0
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_mechanizations_agree(name):
+    solutions = [fly(MOTIONS[name], Strapdown("high-order:6", m, whole_record=True), 250.0, 0.01) for m in EXACT]
+    places = [cartesian(position) for position, *_ in solutions]
+    for place, (_, velocity, q_nb) in zip(places, solutions, strict=True):
+        assert np.abs(place - places[0]).max() < 1e-7
+        assert np.abs(velocity - solutions[0][1]).max() < 1e-9
+        assert np.abs(attitude_error(q_nb[-1], solutions[0][2][-1])).max() < 1e-13
+
+
+@pytest.mark.parametrize("attitude", ATTITUDES)
+def test_attitude_methods_in_flight(attitude):
+    """From second order on every method keeps the flight: its attitude alone differs."""
+    position, *_ = fly(MOTIONS["flight"], Strapdown(attitude), 100.0, 0.01)
+    assert way_off(MOTIONS["flight"], position, 0.01).max() < 1e-6
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+@pytest.mark.parametrize(("attitude", "limit"), [("two-sample", 1e-4), ("high-order:4", 1e-6), ("high-order:6", 1e-6)])
+def test_samples_as_they_come_from_rest(mechanization, attitude, limit):
+    """Without samples to come the polynomial is as good, once it has its samples: here it gets them at rest."""
+    motion = Motion(AGILE.model_copy(update={"rest_s": 2.0, "ramp_s": 10.0}))
+    position, *_ = fly(motion, Strapdown(attitude, mechanization), 100.0, 0.01)
+    assert way_off(motion, position, 0.01).max() < limit
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+@pytest.mark.parametrize(("attitude", "order"), [("two-sample", 2.8), ("high-order:4", 5.5)])
+def test_order_in_the_step(mechanization, attitude, order):
+    motion = MOTIONS["agile"]
+    errors = [
+        way_off(motion, fly(motion, Strapdown(attitude, mechanization, whole_record=True), 96.0, step)[0], step).max()
+        for step in (0.02, 0.04, 0.08)
+    ]
+    assert (np.log2(np.divide(errors[1:], errors[:-1])) > order).all(), errors
+
+
+def test_the_source_is_of_first_order():
+    motion, steps = MOTIONS["flight"], (0.001, 0.002, 0.005, 0.01)
+    errors = [
+        way_off(motion, fly(motion, Strapdown(mechanization="inertial-source"), 50.0, step)[0], step).max()
+        for step in steps
+    ]
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+def test_steps_of_a_second(mechanization):
+    motion = MOTIONS["flight"]
+    for attitude, limit in (("two-sample", 0.3), ("high-order:4", 5e-3)):
+        position, *_ = fly(motion, Strapdown(attitude, mechanization, whole_record=True), 200.0, 1.0)
+        assert way_off(motion, position, 1.0).max() < limit
+
+
+@settings(max_examples=6)
+@given(
+    st.integers(0, 2**32 - 1), st.sampled_from(EXACT), st.sampled_from(["two-sample", "high-order:4"]), st.booleans()
+)
+def test_unequal_steps(seed, mechanization, attitude, whole):
+    """Steps of 5, 10 and 15 ms in any order are at worst about as wrong as steps of 15 ms."""
+    motion = MOTIONS["flight"]
+    step, dtheta, dvel = increments(motion, 60.0, 0.005)
+    edges = np.concatenate([[0], np.cumsum(np.random.default_rng(seed).integers(1, 4, len(step)))])
+    edges = np.unique(np.append(edges[edges < len(step)], len(step)))
+    core = Strapdown(attitude, mechanization, whole_record=whole)
+    begin(core, motion.truth([0.0])[0])
+    joined = (np.add.reduceat(x, edges[:-1]) for x in (step, dtheta, dvel))
+    done, position, *_ = advance(core, *joined)
+    assert done == len(edges) - 1
+    jittered = way_off(motion, position[-1:], 60.0)[0]
+    regular = fly(motion, Strapdown(attitude, mechanization, whole_record=whole), 60.0, 0.015)[0]
+    assert jittered < 2.0 * way_off(motion, regular, 0.015)[-1] + 1e-7
+
+
+@settings(max_examples=25)
+@given(
+    st.sampled_from(MECHANIZATIONS),
+    st.sampled_from(ATTITUDES),
+    st.sampled_from(["normal", "j2"]),
+    st.lists(st.integers(0, 60), max_size=8),
+    st.integers(0, 2**32 - 1),
+)
+def test_how_a_stream_is_split_does_not_matter(mechanization, attitude, gravity, cuts, seed):
+    """Same bits, with steps of zero among them and more samples than the core had room for."""
+    attitude = "two-sample" if mechanization == "inertial-source" else attitude
+    step, dtheta, dvel = increments(MOTIONS["agile"], 3.0, 0.01)
+    nothing = np.random.default_rng(seed).integers(0, 300, 10)
+    step[nothing], dtheta[nothing], dvel[nothing] = 0.0, 0.0, 0.0
+    whole, split = (Strapdown(attitude, mechanization, gravity) for _ in range(2))
+    for core in whole, split:
+        begin(core, MOTIONS["agile"].truth([0.0])[0])
+    _, *expected = advance(whole, step, dtheta, dvel)
+    edges = np.concatenate([[0], np.cumsum(cuts), [300]]).clip(max=300).astype(int)
+    parts = [advance(split, step[i:j], dtheta[i:j], dvel[i:j]) for i, j in pairwise(edges)]
+    for k in range(3):
+        np.testing.assert_array_equal(np.concatenate([part[k + 1] for part in parts]), expected[k])
+    np.testing.assert_array_equal(whole.solution, split.solution)
+    assert whole.azimuth == split.azimuth
+
+
+@pytest.mark.parametrize("mechanization", MECHANIZATIONS)
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4", "coning:3"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_steps_of_zero_change_nothing(mechanization, attitude, whole):
+    attitude = "two-sample" if mechanization == "inertial-source" else attitude
+    step, dtheta, dvel = increments(MOTIONS["agile"], 2.0, 0.01)
+    plain, padded, idle = (Strapdown(attitude, mechanization, whole_record=whole) for _ in range(3))
+    for core in plain, padded, idle:
+        begin(core, MOTIONS["agile"].truth([0.0])[0])
+    _, *expected = advance(plain, step, dtheta, dvel)
+    longer = np.stack([np.zeros(200), step], axis=1).ravel()
+    _, *got = advance(padded, longer, dtheta.repeat(2, 0), dvel.repeat(2, 0))
+    for one, other in zip(expected, got, strict=True):
+        np.testing.assert_array_equal(one, other[1::2])
+    before = idle.solution.copy()
+    advance(idle, np.zeros(5), dtheta[:5], dvel[:5])
+    height = 2  # comes from Earth-centred coordinates: their rounding
+    assert idle.solution[height] == pytest.approx(before[height], abs=4e-9)
+    np.testing.assert_allclose(np.delete(idle.solution, height), np.delete(before, height), rtol=1e-14, atol=1e-12)
+
+
+# Symmetries
+
+
+@pytest.mark.parametrize("mechanization", MECHANIZATIONS)
+@pytest.mark.parametrize("turn", [-3.0, 1.0, 2.2])
+def test_longitude_is_a_symmetry(mechanization, turn):
+    row = MOTIONS["agile"].truth([0.0])[0]
+    one, other = Strapdown(mechanization=mechanization), Strapdown(mechanization=mechanization)
+    begin(one, row)
+    begin(other, row, turn)
+    data = increments(MOTIONS["agile"], 10.0, 0.01)
+    _, one_place, one_velocity, one_q = advance(one, *data)
+    _, place, velocity, q_nb = advance(other, *data)
+    assert (np.abs(place[:, 1]) <= math.pi).all()
+    assert np.abs(np.sin(place[:, 1] - one_place[:, 1] - turn)).max() < 1e-14
+    assert np.abs(place[:, [0, 2]] - one_place[:, [0, 2]]).max() < 1e-8
+    assert np.abs(velocity - one_velocity).max() < 1e-10
+    assert np.abs(attitude_error(q_nb[-1], one_q[-1])).max() < 1e-13
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+@pytest.mark.parametrize("gravity", ["normal", "j2"])
+def test_time_runs_backwards(mechanization, gravity):
+    """Flown back from the end with the inertial velocity turned round: the start again, twice the Earth's turn westward."""
+    row = MOTIONS["agile"].truth([0.0])[0]
+    core = Strapdown("high-order:4", mechanization, gravity, whole_record=True)
+    begin(core, row)
+    step, dtheta, dvel = increments(MOTIONS["agile"], 60.0, 0.01)
+    advance(core, step, dtheta, dvel)
+    lat, lon, height, vel_n, q_nb = *core.solution[:3], core.solution[3:6].copy(), core.solution[6:].copy()
+    core.start(lat, lon, height, turned_round(vel_n, lat, height), q_nb)
+    advance(core, step, -dtheta[::-1], dvel[::-1])
+    lat, lon, height = core.solution[:3]
+    assert math.remainder(lon + 2.0 * RATE * 60.0 - row["lon"], 2.0 * math.pi) == pytest.approx(0.0, abs=3e-15)
+    assert lat == pytest.approx(row["lat"], abs=3e-15)
+    assert height == pytest.approx(row["height"], abs=2e-8)
+    assert np.abs(turned_round(core.solution[3:6], lat, height) - row["vel_n"]).max() < 1e-9
+    assert np.abs(attitude_error(core.solution[6:], row["q_nb"])).max() < 1e-13
+
+
+def turned_round(vel_n, lat, height):
+    _, prime = curvature_radii(math.sin(lat))
+    return -vel_n - [0.0, 2.0 * RATE * (prime + height) * math.cos(lat), 0.0]
+
+
+# Rest
+
+REST = math.radians(60.0), 0.6, 120.0
+REST_ATTITUDE = Rotation.from_euler("ZYX", [37, 5, 3], degrees=True)
+
+
+def rest_increments(n, step):
+    lat, _, height = REST
+    rate = REST_ATTITUDE.inv().apply([RATE * math.cos(lat), 0.0, -RATE * math.sin(lat)])
+    force = REST_ATTITUDE.inv().apply([0.0, 0.0, -normal_gravity(math.sin(lat), height)])
+    return np.full(n, step), np.tile(rate * step, (n, 1)), np.tile(force * step, (n, 1))
+
+
+def moved(position):
+    """Horizontal way from the place of rest, m."""
+    lat, lon, height = REST
+    meridian, prime = curvature_radii(math.sin(lat))
+    position = np.atleast_2d(position)
+    east = np.sin(position[:, 1] - lon) * (prime + height) * math.cos(lat)
+    return np.hypot((position[:, 0] - lat) * (meridian + height), east)
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4"])
+def test_an_hour_at_rest(mechanization, attitude):
+    core = Strapdown(attitude, mechanization)
+    core.start(*REST, np.zeros(3), REST_ATTITUDE.as_quat(scalar_first=True))
+    done, position, velocity, q_nb = advance(core, *rest_increments(72_000, 0.05))
+    assert done == 72_000
+    assert moved(position).max() < 1e-4
+    # The vertical channel grows 45 000-fold in an hour: exp(t sqrt(2 g / R)) / 2
+    assert np.abs(position[:, 2] - REST[2]).max() < 0.05
+    assert np.abs(velocity[:, :2]).max() < 1e-7
+    assert np.abs(attitude_error(q_nb[-1], REST_ATTITUDE.as_quat(scalar_first=True))).max() < 3e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mechanization", EXACT)
+def test_a_day_at_rest_with_the_height_held(mechanization):
+    core = Strapdown(mechanization=mechanization)
+    core.start(*REST, np.zeros(3), REST_ATTITUDE.as_quat(scalar_first=True))
+    data, worst = rest_increments(10, 0.1), 0.0
+    for _ in range(86_400):
+        advance(core, *data)
+        lat, lon, _, north, east, _, *q_nb = core.solution
+        worst = max(worst, float(moved(core.solution[:3])[0]))
+        core.start(lat, lon, REST[2], np.array([north, east, 0.0]), np.array(q_nb))
+    assert worst < 1e-4
+    assert np.abs(attitude_error(core.solution[6:], REST_ATTITUDE.as_quat(scalar_first=True))).max() < 1e-10
+
+
+# The pole
+
+POLE_STEP, POLE_STEPS, POLE_TURN = 0.01, 6000, 240.0 / 6.4e6
+POLE_LON, POLE_HEIGHT = 0.4, 9000.0
+
+
+def pole_body(time, sign):
+    """Increments' integrands on the meridian flight over the pole, the place and the level's attitude q_nb before it.
+
+    The angle along the meridian grows evenly from before the pole; beyond it, it exceeds 90 degrees. Axes: forward along the
+    meridian, right, down.
+    """
+    angle = 0.5 * math.pi + POLE_TURN * (time - 0.5 * POLE_STEP * POLE_STEPS)
+    s, c = np.sin(angle), np.cos(angle)
+    meridian = A * (1.0 - E2) / (1.0 - E2 * s * s) ** 1.5
+    speed = (meridian + POLE_HEIGHT) * POLE_TURN
+    slope = 3.0 * meridian * E2 * s * c / (1.0 - E2 * s * s) * POLE_TURN**2
+    gravity = np.array([normal_gravity(x, POLE_HEIGHT) for x in s])
+    # At the south pole everything is mirrored but the Earth's turn: as if it turned the other way.
+    rate = sign * RATE
+    force = np.stack([slope, -2.0 * rate * speed * s, speed * POLE_TURN - gravity], axis=1)
+    turn = np.stack([rate * c, np.full_like(s, -POLE_TURN), -rate * s], axis=1)
+    return angle, speed, turn, force
+
+
+def pole_flight(sign, roll=0.3, pulsation=1.7):
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    time = (POLE_STEP * (np.arange(POLE_STEPS)[:, None] + 0.5 * (nodes + 1.0))).ravel()
+    _, _, turn, force = pole_body(time, sign)
+    bank = roll * np.sin(pulsation * time)
+    about = Rotation.from_rotvec(bank[:, None] * [1.0, 0.0, 0.0]).inv()
+    turn = about.apply(turn) + (roll * pulsation * np.cos(pulsation * time))[:, None] * [1.0, 0.0, 0.0]
+    both = np.stack([turn, about.apply(force)]).reshape(2, POLE_STEPS, 6, 3)
+    dtheta, dvel = 0.5 * POLE_STEP * np.einsum("j,bkji->bki", weights, both)
+    angle, speed, _, _ = pole_body(POLE_STEP * np.arange(POLE_STEPS + 1), sign)
+    bank = roll * np.sin(pulsation * POLE_STEP * np.arange(POLE_STEPS + 1))
+    return dtheta, dvel, angle, speed, bank
+
+
+@pytest.mark.parametrize("mechanization", EVERYWHERE)
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4"])
+def test_over_the_north_pole(mechanization, attitude):
+    dtheta, dvel, angle, speed, bank = pole_flight(1.0)
+    core = Strapdown(attitude, mechanization, whole_record=True)
+    core.start(angle[0], POLE_LON, POLE_HEIGHT, np.array([speed[0], 0, 0]), np.array([1.0, 0, 0, 0]))
+    done, position, velocity, q_nb = advance(core, np.full(POLE_STEPS, POLE_STEP), dtheta, dvel)
+    assert done == POLE_STEPS
+    assert np.isfinite(position).all()
+    assert np.isfinite(velocity).all()
+    assert np.isfinite(q_nb).all()
+    beyond = angle[1:] > 0.5 * math.pi
+    lat, lon = np.where(beyond, math.pi - angle[1:], angle[1:]), POLE_LON + math.pi * beyond
+    right = cartesian(np.stack([lat, lon, np.full(POLE_STEPS, POLE_HEIGHT)], axis=1))
+    limit = 3e-5 if attitude == "two-sample" else 2e-8
+    assert np.linalg.norm(cartesian(position) - right, axis=1).max() < limit
+    # Beyond the pole the same course is southward; close by, north turns too fast to be compared.
+    far = np.abs(angle[1:] - 0.5 * math.pi) > 1e-5
+    north = np.where(beyond, -speed[1:], speed[1:])
+    assert np.abs(velocity[far, 0] - north[far]).max() < limit / 10.0
+    assert np.abs(velocity[far, 1]).max() < max(limit, 1e-6)
+    course = Rotation.from_euler("z", 180.0, degrees=True) * Rotation.from_euler("x", bank[-1])
+    assert np.abs(attitude_error(q_nb[-1], course.as_quat(scalar_first=True))).max() < max(limit / 100.0, 1e-8)
+
+
+@pytest.mark.parametrize("mechanization", EVERYWHERE)
+def test_over_the_south_pole(mechanization):
+    """The flight mirrored: there the Earth turns the other way round the level."""
+    dtheta, dvel, angle, speed, _ = pole_flight(-1.0)
+    places = []
+    for name in (mechanization, "earth"):
+        core = Strapdown("high-order:4", name, whole_record=True)
+        core.start(-angle[0], POLE_LON, POLE_HEIGHT, np.array([-speed[0], 0, 0]), np.array([0.0, 0, 0, 1.0]))
+        places.append(cartesian(advance(core, np.full(POLE_STEPS, POLE_STEP), dtheta, dvel)[1]))
+    beyond = angle[1:] > 0.5 * math.pi
+    lat, lon = -np.where(beyond, math.pi - angle[1:], angle[1:]), POLE_LON + math.pi * beyond
+    right = cartesian(np.stack([lat, lon, np.full(POLE_STEPS, POLE_HEIGHT)], axis=1))
+    assert np.abs(places[0] - places[1]).max() < 2e-8
+    assert np.linalg.norm(places[0] - right, axis=1).max() < 2e-8
+
+
+def test_geographic_stops_before_the_pole():
+    dtheta, dvel, angle, speed, _ = pole_flight(1.0)
+    core = Strapdown()
+    core.start(angle[0], POLE_LON, POLE_HEIGHT, np.array([speed[0], 0, 0]), np.array([1.0, 0, 0, 0]))
+    done, position, *_ = advance(core, np.full(POLE_STEPS, POLE_STEP), dtheta, dvel)
+    assert 0 < done < POLE_STEPS
+    assert np.isnan(position[done:]).all()
+    navigator = Navigator(Settings())
+    navigator.begin(angle[0], POLE_LON, POLE_HEIGHT, np.array([speed[0], 0, 0]), np.array([1.0, 0, 0, 0]), 0.0)
+    with pytest.raises(HilError, match="the geographic mechanization is singular at the pole: stopped at latitude 89"):
+        navigator.process(record(dtheta, dvel, POLE_STEP))
+
+
+def record(dtheta, dvel, step):
+    imu = ImuIncrements.empty(len(dtheta))
+    imu.time[:], imu.step[:] = step * np.arange(1, len(dtheta) + 1), step
+    imu.dtheta[:], imu.dvel[:], imu.sequence[:] = dtheta, dvel, np.arange(len(dtheta))
+    return imu
+
+
+# Wander azimuth
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_azimuth_changes_by_the_solid_angle(sense):
+    """Ishlinsky on a circle of 20 km: the change is its area over R^2, positive clockwise; exactly, the integral of sin B dL."""
+    config = MotionConfig.model_validate(
+        {
+            "latitude_deg": 55.0,
+            "attitude": "coordinated",
+            "north": {"sines": [{"amplitude": 20_000, "period_s": 600, "phase_deg": 90}]},
+            "east": {"sines": [{"amplitude": sense * 20_000, "period_s": 600}]},
+        }
+    )
+    motion = Motion(config)
+    core = Strapdown("high-order:4", "wander", whole_record=True)
+    fly(motion, core, 600.0, 0.02)
+    truth = motion.truth(np.linspace(0.0, 600.0, 6001))
+    # Trapezoid of a periodic integrand: L' from the velocity
+    _, prime = np.array([curvature_radii(math.sin(lat)) for lat in truth["lat"]]).T
+    rate = truth["vel_n"][:, 1] * np.tan(truth["lat"]) / (prime + truth["height"])
+    assert core.azimuth == pytest.approx(0.1 * rate[:-1].sum(), abs=1e-12)
+    meridian, prime = curvature_radii(math.sin(math.radians(55.0)))
+    assert core.azimuth == pytest.approx(sense * math.pi * 20_000**2 / (meridian * prime), rel=2e-3)
+
+
+@settings(max_examples=10)
+@given(st.floats(-math.pi, math.pi))
+def test_the_azimuth_at_the_start_does_not_matter(azimuth):
+    """A and the gyroscopic heading depend on it, their sum and all that leaves the mechanization does not."""
+    row = MOTIONS["agile"].truth([0.0])[0]
+    one, other = Strapdown("high-order:4", "wander"), Strapdown("high-order:4", "wander")
+    begin(one, row)
+    begin(other, row)
+    other._state = wander.start(row["lat"], row["lon"], row["height"], row["vel_n"], row["q_nb"], azimuth)
+    data = increments(MOTIONS["agile"], 20.0, 0.01)
+    _, one_place, one_velocity, one_q = advance(one, *data)
+    _, place, velocity, q_nb = advance(other, *data)
+    assert np.abs(cartesian(place) - cartesian(one_place)).max() < 2e-8
+    assert np.abs(velocity - one_velocity).max() < 1e-9
+    assert np.abs(attitude_error(q_nb[-1], one_q[-1])).max() < 1e-13
+    assert math.remainder(other.azimuth - one.azimuth - azimuth, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-13)
+
+
+# Gravitation
+
+
+def j2_gradient(x, y, z):
+    """Gradient of the potential by complex steps: no differences, no cancellation."""
+    h = 1e-20
+
+    def potential(x, y, z):
+        r2 = x * x + y * y + z * z
+        return GM / np.sqrt(r2) * (1.0 - J2 * A * A / r2 * (1.5 * z * z / r2 - 0.5))
+
+    return np.array([potential(x + 1j * h, y, z), potential(x, y + 1j * h, z), potential(x, y, z + 1j * h)]).imag / h
+
+
+PLACES = [(lat, lon, h) for lat in (-90, -37.5, 0, 1e-6, 45, 60, 89.9) for lon in (-120, 10) for h in (-100, 0, 20e3)]
+
+
+def test_j2_is_the_gradient_of_its_potential():
+    for lat, lon, height in PLACES:
+        x, y, z = (float(v) for v in pymap3d.geodetic2ecef(lat, lon, height))
+        s, c = math.sin(math.radians(lat)), math.cos(math.radians(lat))
+        np.testing.assert_allclose(gravitation_cartesian(J2_FIELD, x, y, z, s, c), j2_gradient(x, y, z), atol=1e-13)
+        north, down = gravitation_local(J2_FIELD, s, c, float(height), math.hypot(x, y))
+        of_n = pymap3d.ecef2enuv(*j2_gradient(x, y, z), lat, lon)
+        np.testing.assert_allclose([north, -down], [of_n[1], of_n[2]], atol=1e-13)
+
+
+def test_normal_is_normal_gravity_without_the_centrifugal_part():
+    for lat, lon, height in PLACES:
+        x, y, z = (float(v) for v in pymap3d.geodetic2ecef(lat, lon, height))
+        s, c = math.sin(math.radians(lat)), math.cos(math.radians(lat))
+        g = np.array(gravitation_cartesian(NORMAL, x, y, z, s, c)) + RATE**2 * np.array([x, y, 0.0])
+        east, north, up = pymap3d.ecef2enuv(*g, lat, lon)
+        np.testing.assert_allclose([east, north, -up], [0.0, 0.0, normal_gravity(s, float(height))], atol=1e-14)
+
+
+def test_how_far_the_fields_are_apart():
+    """About 1.2e-4 m/s^2 at most, vertically as to the north, at 10 km."""
+    difference = []
+    for lat in np.radians(np.arange(-90, 91)):
+        s, c = math.sin(lat), math.cos(lat)
+        axis = (curvature_radii(s)[1] + 10e3) * c
+        pairs = (gravitation_local(field, s, c, 10e3, axis) for field in (NORMAL, J2_FIELD))
+        difference.append(np.subtract(*pairs))
+    north, down = np.abs(difference).max(axis=0)
+    assert 5e-5 < north < 1.3e-4
+    assert 5e-5 < down < 1.3e-4
+
+
+@pytest.mark.parametrize("mechanization", EXACT)
+def test_the_wrong_field_shows_as_an_acceleration(mechanization):
+    motion = MOTIONS["flight"]
+    right, wrong = (
+        fly(motion, Strapdown("two-sample", mechanization, field), 10.0, 0.01)[1][-1] for field in ("normal", "j2")
+    )
+    (row,) = motion.truth([0.0])
+    s, c = math.sin(row["lat"]), math.cos(row["lat"])
+    axis = (curvature_radii(s)[1] + row["height"]) * c
+    normal, j2 = (gravitation_local(field, s, c, float(row["height"]), axis) for field in (NORMAL, J2_FIELD))
+    assert wrong - right == pytest.approx(10.0 * np.array([j2[0] - normal[0], 0.0, j2[1] - normal[1]]), abs=2e-6)
+
+
+@given(st.floats(-90, 90), st.floats(-1000, 1000), st.floats(-500, 2e4))
+def test_near_latitude(lat, way, height):
+    """One Newton step from a place within a kilometre leaves about e^2 of the way's square and half of its cube."""
+    new = min(90.0, max(-90.0, lat + math.degrees(way / 6.4e6)))
+    x, _, z = pymap3d.geodetic2ecef(new, 0.0, height)
+    old = math.radians(lat)
+    s, c = near_latitude(abs(float(x)), float(z), math.sin(old), math.cos(old))
+    assert math.atan2(s, c) == pytest.approx(
+        math.radians(new), abs=0.006 * (way / 6.4e6) ** 2 + abs(way / 6.4e6) ** 3 + 3e-16
+    )
+    assert math.hypot(s, c) == pytest.approx(1.0, abs=1e-15)
+
+
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("choice", "say"),
+    [
+        ({"attitude": "high-order:9"}, "high-order:N takes N = 3..8"),
+        ({"attitude": "high-order:x"}, "high-order:N takes N = 3..8"),
+        ({"attitude": "three-sample"}, r"there is: two-sample, high-order\[:N\] \(N = 3\.\.8\), poisson-rk4, "),
+        ({"attitude": "coning:6"}, "N from 1 to 5"),
+        ({"mechanization": "polar"}, "there is: geographic, wander, earth, inertial, inertial-source"),
+        ({"mechanization": "inertial-source", "attitude": "picard3"}, "has its own attitude: it takes no 'picard3'"),
+        ({"gravity": "j4"}, "there is: normal, j2"),
+    ],
+)
+def test_unknown_names_are_refused(choice, say):
+    with pytest.raises(HilError, match=say):
+        Strapdown(**choice)
+
+
+@pytest.mark.parametrize("mechanization", MECHANIZATIONS)
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_what_is_not_a_number_never_enters(mechanization, value):
+    navigator = Navigator(Settings(mechanization=mechanization))
+    navigator.begin(*REST, np.zeros(3), REST_ATTITUDE.as_quat(scalar_first=True), 0.0)
+    _, dtheta, dvel = rest_increments(10, 0.01)
+    dvel[7, 2] = value
+    with pytest.raises(HilError, match="increment 7 is not a number"):
+        navigator.process(record(dtheta, dvel, 0.01))
+    dvel[7, 2] = dvel[6, 2]
+    assert np.isfinite(navigator.process(record(dtheta, dvel, 0.01))["vel_n"]).all()
