@@ -262,11 +262,9 @@ def bench(as_json: Json = False) -> None:
         print(json.dumps({"rows": rows}))
         return
     for row in rows:
-        ratio = (
-            ""
-            if row["peer_ns"] is None
-            else f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
-        )
+        ratio = "" if row["ratio_to_c"] is None else f"   {row['ratio_to_c']:.2f} of C"
+        if row["peer_ns"] is not None:
+            ratio += f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
         print(f"{row['id']:24} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 

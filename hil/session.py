@@ -153,7 +153,8 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
-        if self.outlets.stats["phase"] == Phase.STARTING:
+        recorder = self._parts.get("recorder")
+        if self.outlets.stats["phase"] == Phase.STARTING or (recorder and "ready" not in recorder.answers):
             return False
         if not self.outlets.control.go:
             self._began = time.monotonic()
