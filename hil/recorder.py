@@ -22,6 +22,7 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
     lost = 0
     try:
         with RecordingWriter(path, header) as writer:
+            ring.pull(batch, 0)  # loads the kernel; nothing is sent before we are ready
             answer.send({"ready": True})
             while True:
                 done = stats["phase"] in (Phase.DONE, Phase.FAILED)
