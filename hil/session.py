@@ -31,9 +31,10 @@ from nav.state import NAV_STATE, Mode
 
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
-READERS = ("recorder", "publisher")
-"""Parts that only read what the loop gives."""
-READER_NICE = 10
+PUBLISHER_NICE = 10
+"""How far the publisher steps back behind the loop where processors are few."""
+RECORDER_STOP_S = 60.0
+"""The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
 DRAIN_S = 1.0
@@ -117,7 +118,7 @@ class Session:
             ours, theirs = context.Pipe()
             process = context.Process(
                 target=run_part,
-                args=(outlets.control, READER_NICE if name in READERS else 0, target, *args, theirs),
+                args=(outlets.control, PUBLISHER_NICE if name == "publisher" else 0, target, *args, theirs),
                 name=f"hil-{name}",
                 daemon=True,
             )
@@ -251,7 +252,8 @@ class Session:
                 continue
             if name == "publisher":
                 self._publisher_stop.call()
-            while part.process.is_alive() and time.monotonic() < deadline:
+            patience = RECORDER_STOP_S if name == "recorder" else 0.0
+            while part.process.is_alive() and time.monotonic() < deadline + patience:
                 part.read()
                 part.process.join(0.02)
             if part.process.is_alive():

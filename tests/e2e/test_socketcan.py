@@ -150,8 +150,8 @@ def test_candump_saw_what_we_recorded(
     scenario.write_text(SCENARIO.replace("[head]", f'[head]\nlayout = "{layout}"'))
     ours = tmp_path / "ours.dhil"
     bridge = hil_bridge(scenario, simulate_head=False, bus=BUS, record=ours, duration_s=2)
-    live = start("candump", "-L", "vcan0", stdout=(tmp_path / "live.txt").open("w"))
-    logged = start("candump", "-l", "vcan0", cwd=tmp_path)
+    live = start("candump", "-r", "8000000", "-L", "vcan0", stdout=(tmp_path / "live.txt").open("w"))
+    logged = start("candump", "-r", "8000000", "-l", "vcan0", cwd=tmp_path)
     time.sleep(1.0)
     report_of(start(*HIL, "imu", scenario, "--bus", BUS, "--duration", 2, "--json"))
     summary = bridge.wait_end(60)
