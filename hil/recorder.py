@@ -14,7 +14,7 @@ from nav.errors import HilError
 
 
 def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: Connection) -> None:
-    """Record until the loop is done and the ring is empty; answers ``{"recorded", "lost"}`` or ``{"failed"}``."""
+    """Record until the loop is done and the ring is empty; answers ``{"file", "frames", "lost"}`` or ``{"failed"}``."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ring, control, stats = outlets.frames, outlets.control, outlets.stats
     wake = ring.wakes[0]
@@ -39,7 +39,6 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
                     select.select([wake], [], [], FLUSH_S)
                     wake.clear()
             writer.flush()
-            stats["recorded"] = writer.written
         answer.send({"file": str(path), "frames": writer.written, "lost": lost})
     except (HilError, OSError) as error:
         control.recorded = 1 << 62  # the loop must not wait for us

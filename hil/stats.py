@@ -36,10 +36,7 @@ _FIELDS = (
     "version_errors",
     "restarts",
     "interpolated",
-    "bridged",
     "silences",
-    "bus_failures",
-    "recorded",
     "recorder_lost",
     "age_us",
     "position_error_mm",  # -1: no truth
