@@ -147,7 +147,7 @@ def navigate(
     Raises
     ------
     HilError
-        Time does not increase, unknown method, or the mechanization cannot go on.
+        Time does not increase, unknown method, or an increment is not a number.
     """
     time = table[:, 0]
     step = np.diff(time, prepend=start["time_s"])
@@ -167,12 +167,7 @@ def navigate(
     n = len(table)
     position, velocity, quaternion = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
     dtheta, dvel = np.ascontiguousarray(table[:, 1:4]), np.ascontiguousarray(table[:, 4:7])
-    done = core.advance(step, dtheta, dvel, np.zeros(3), position, velocity, quaternion)
-    if done < n:
-        raise HilError(
-            f"row {done + 1}: the {mechanization} mechanization is singular at the pole "
-            f"(latitude {math.degrees(core.solution[0]):.4f} deg); use wander, earth or inertial"
-        )
+    core.advance(step, dtheta, dvel, np.zeros(3), position, velocity, quaternion)
     angles = np.degrees(euler_angles(quaternion))
     place = np.column_stack([np.degrees(position[:, :2]), position[:, 2]])
     return np.column_stack([time, place, velocity, angles[:, ::-1]])

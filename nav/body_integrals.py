@@ -26,9 +26,13 @@ from nav.kernel import inline_kernel, kernel
 
 MAX_WINDOW = 8
 """Most samples in a polynomial."""
-MEMORY = 2 + 7 * MAX_WINDOW + MAX_WINDOW * MAX_WINDOW
-"""Floats that the stream remembers: samples seen, window for which the weights hold, increments, weights."""
-_SEEN, _READY, _WINDOW, _WEIGHTS = 0, 1, 2, 2 + 7 * MAX_WINDOW
+_SEEN, _READY, _WINDOW = 0, 1, 2
+_WEIGHTS = _WINDOW + 7 * MAX_WINDOW
+_STEPS = _WEIGHTS + MAX_WINDOW * MAX_WINDOW
+_TABLE = _STEPS + MAX_WINDOW
+_COEFFICIENT = _TABLE + 2 * MAX_WINDOW * MAX_WINDOW
+MEMORY = _COEFFICIENT + 6 * MAX_WINDOW
+"""Floats that the stream remembers: samples seen, window for which the weights hold, increments, weights; and room to work."""
 
 _ROOT15 = math.sqrt(15.0)
 _NODE = (0.5 - 0.1 * _ROOT15, 0.5, 0.5 + 0.1 * _ROOT15)
@@ -76,14 +80,15 @@ def change_by_turn(x: float, y: float, z: float, vx: float, vy: float, vz: float
 
 
 @kernel
-def _fit_weights(steps: FloatArray, place: int, weights: FloatArray) -> None:
-    """Weights (m, m) that take m increments to the coefficients of their polynomial over the step number `place`.
+def _fit_weights(steps: FloatArray, place: int, weights: FloatArray, room: FloatArray) -> None:
+    """Weights that take m increments to the coefficients of their polynomial over the step number `place`.
 
     The integrand is sum_j a_j s^j, s from 0 to 1 over that step, per unit of s; a_j = sum_i weights[j, i] increment_i,
-    oldest first.
+    oldest first. `room` has 2 m^2 floats to work in.
     """
     m = len(steps)
-    table = np.zeros((m, 2 * m))
+    table = room[: 2 * m * m].reshape((m, 2 * m))
+    table[:] = 0.0
     left = 0.0
     for i in range(place):
         left -= steps[i] / steps[place]
@@ -128,31 +133,39 @@ def _integrate_polynomial(
         s = _NODE[node]
         wx = wy = wz = fx = fy = fz = gx = gy = gz = 0.0
         for j in range(m - 1, -1, -1):
-            wx, wy, wz = wx * s + coefficient[j, 0], wy * s + coefficient[j, 1], wz * s + coefficient[j, 2]
-            fx, fy, fz = fx * s + coefficient[j, 3], fy * s + coefficient[j, 4], fz * s + coefficient[j, 5]
+            wx, wy, wz = wx * s + coefficient[6 * j], wy * s + coefficient[6 * j + 1], wz * s + coefficient[6 * j + 2]
+            fx, fy, fz = (
+                fx * s + coefficient[6 * j + 3],
+                fy * s + coefficient[6 * j + 4],
+                fz * s + coefficient[6 * j + 5],
+            )
             g = 1.0 / (j + 1.0)
-            gx, gy, gz = gx * s + g * coefficient[j, 0], gy * s + g * coefficient[j, 1], gz * s + g * coefficient[j, 2]
+            gx, gy, gz = (
+                gx * s + g * coefficient[6 * j],
+                gy * s + g * coefficient[6 * j + 1],
+                gz * s + g * coefficient[6 * j + 2],
+            )
         # Angle to the node: alpha + (1/2) int alpha x w, the latter by the polynomial's first three coefficients.
         hx, hy, hz = s * gx, s * gy, s * gz
         if m > 1:
             kx, ky, kz = cross(
-                coefficient[0, 0],
-                coefficient[0, 1],
-                coefficient[0, 2],
-                coefficient[1, 0],
-                coefficient[1, 1],
-                coefficient[1, 2],
+                coefficient[0],
+                coefficient[1],
+                coefficient[2],
+                coefficient[6],
+                coefficient[7],
+                coefficient[8],
             )
             g = s * s * s / 12.0
             hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
         if m > 2:
             kx, ky, kz = cross(
-                coefficient[0, 0],
-                coefficient[0, 1],
-                coefficient[0, 2],
-                coefficient[2, 0],
-                coefficient[2, 1],
-                coefficient[2, 2],
+                coefficient[0],
+                coefficient[1],
+                coefficient[2],
+                coefficient[12],
+                coefficient[13],
+                coefficient[14],
             )
             g = s * s * s * s / 12.0
             hx, hy, hz = hx + g * kx, hy + g * ky, hz + g * kz
@@ -226,8 +239,6 @@ def integrate_body(
     dv, ds : (n, 3) float
         Out: velocity and position integrals in the body axes at the step's start, m/s and m.
     """
-    coefficient = np.zeros((MAX_WINDOW, 6))
-    steps, weights = np.empty(MAX_WINDOW), np.empty((MAX_WINDOW, MAX_WINDOW))
     bx, by, bz = gyro_bias[0], gyro_bias[1], gyro_bias[2]
     top = _WINDOW + 7 * (MAX_WINDOW - 1)
     for k in range(step.shape[0]):
@@ -240,66 +251,80 @@ def integrate_body(
             continue
         x, y, z = dtheta[k, 0] - bx * t, dtheta[k, 1] - by * t, dtheta[k, 2] - bz * t
         u, v, w = dvel[k, 0], dvel[k, 1], dvel[k, 2]
-        seen = min(int(memory[_SEEN]) + 1, MAX_WINDOW)
-        memory[_SEEN] = seen
-        if window == 2:
-            t0 = memory[top]
-            px, py, pz = memory[top + 1], memory[top + 2], memory[top + 3]
-            qx, qy, qz = memory[top + 4], memory[top + 5], memory[top + 6]
-            memory[top] = t
-            memory[top + 1], memory[top + 2], memory[top + 3] = x, y, z
-            memory[top + 4], memory[top + 5], memory[top + 6] = u, v, w
-            c = t * t / (6.0 * t0 * (t + t0)) if t0 > 0.0 else 0.0
-            cx, cy, cz = cross(px, py, pz, x, y, z)
-            dq[k, 0], dq[k, 1], dq[k, 2], dq[k, 3] = turn_of(x + c * cx, y + c * cy, z + c * cz)
-            ax, ay, az = cross(x, y, z, u, v, w)
-            sx, sy, sz = cross(px, py, pz, u, v, w)
-            rx, ry, rz = cross(qx, qy, qz, x, y, z)
-            ex, ey, ez = cross(x, y, z, ax, ay, az)
-            dv[k, 0] = u + 0.5 * ax + c * (sx + rx) + ex / 6.0
-            dv[k, 1] = v + 0.5 * ay + c * (sy + ry) + ey / 6.0
-            dv[k, 2] = w + 0.5 * az + c * (sz + rz) + ez / 6.0
-            r = t / t0 if t0 > 0.0 else 0.0
-            b = r / (1.0 + r) / 6.0  # slope of the force: 2 (dv/t - dv0/t0) / (t + t0)
-            ds[k, 0] = t * (0.5 * u - b * (u - r * qx) + ax / 6.0)
-            ds[k, 1] = t * (0.5 * v - b * (v - r * qy) + ay / 6.0)
-            ds[k, 2] = t * (0.5 * w - b * (w - r * qz) + az / 6.0)
+        if window > 2:
+            _remember(memory, window, t, x, y, z, u, v, w)
+            _integrate_newest(memory, k, dq, dv, ds)
             continue
-
-        m = min(seen, window)
-        changed = memory[_READY] != m
-        for i in range(MAX_WINDOW - m, MAX_WINDOW - 1):
-            here = _WINDOW + 7 * i
-            changed = changed or memory[here] != memory[here + 7]
-            for j in range(7):
-                memory[here + j] = memory[here + 7 + j]
-        changed = changed or memory[top] != t
+        t0 = memory[top]
+        px, py, pz = memory[top + 1], memory[top + 2], memory[top + 3]
+        qx, qy, qz = memory[top + 4], memory[top + 5], memory[top + 6]
         memory[top] = t
         memory[top + 1], memory[top + 2], memory[top + 3] = x, y, z
         memory[top + 4], memory[top + 5], memory[top + 6] = u, v, w
-        if changed:
-            for i in range(m):
-                steps[i] = memory[_WINDOW + 7 * (MAX_WINDOW - m + i)]
-            _fit_weights(steps[:m], m - 1, weights)
-            for j in range(m):
-                for i in range(m):
-                    memory[_WEIGHTS + j * MAX_WINDOW + i] = weights[j, i]
-            memory[_READY] = m
-        for j in range(m):
-            c0 = c1 = c2 = c3 = c4 = c5 = 0.0
-            for i in range(m):
-                weight = memory[_WEIGHTS + j * MAX_WINDOW + i]
-                here = _WINDOW + 7 * (MAX_WINDOW - m + i)
-                c0 += weight * memory[here + 1]
-                c1 += weight * memory[here + 2]
-                c2 += weight * memory[here + 3]
-                c3 += weight * memory[here + 4]
-                c4 += weight * memory[here + 5]
-                c5 += weight * memory[here + 6]
-            coefficient[j, 0], coefficient[j, 1], coefficient[j, 2] = c0, c1, c2
-            coefficient[j, 3], coefficient[j, 4], coefficient[j, 5] = c3, c4, c5
+        c = t * t / (6.0 * t0 * (t + t0)) if t0 > 0.0 else 0.0
+        cx, cy, cz = cross(px, py, pz, x, y, z)
+        dq[k, 0], dq[k, 1], dq[k, 2], dq[k, 3] = turn_of(x + c * cx, y + c * cy, z + c * cz)
+        ax, ay, az = cross(x, y, z, u, v, w)
+        sx, sy, sz = cross(px, py, pz, u, v, w)
+        rx, ry, rz = cross(qx, qy, qz, x, y, z)
+        ex, ey, ez = cross(x, y, z, ax, ay, az)
+        dv[k, 0] = u + 0.5 * ax + c * (sx + rx) + ex / 6.0
+        dv[k, 1] = v + 0.5 * ay + c * (sy + ry) + ey / 6.0
+        dv[k, 2] = w + 0.5 * az + c * (sz + rz) + ez / 6.0
+        r = t / t0 if t0 > 0.0 else 0.0
+        b = r / (1.0 + r) / 6.0  # slope of the force: 2 (dv/t - dv0/t0) / (t + t0)
+        ds[k, 0] = t * (0.5 * u - b * (u - r * qx) + ax / 6.0)
+        ds[k, 1] = t * (0.5 * v - b * (v - r * qy) + ay / 6.0)
+        ds[k, 2] = t * (0.5 * w - b * (w - r * qz) + az / 6.0)
 
-        _integrate_polynomial(coefficient, m, t, k, dq, dv, ds)
+
+@inline_kernel
+def _remember(
+    memory: FloatArray, window: int, t: float, x: float, y: float, z: float, u: float, v: float, w: float
+) -> None:
+    """Put a sample into the window; the weights are stale where its steps are not those of the window before."""
+    seen = min(int(memory[_SEEN]) + 1, window)
+    memory[_SEEN] = seen
+    top = _WINDOW + 7 * (MAX_WINDOW - 1)
+    changed = memory[top] != t
+    for i in range(MAX_WINDOW - seen, MAX_WINDOW - 1):
+        here = _WINDOW + 7 * i
+        changed = changed or memory[here] != memory[here + 7]
+        for j in range(7):
+            memory[here + j] = memory[here + 7 + j]
+    memory[top] = t
+    memory[top + 1], memory[top + 2], memory[top + 3] = x, y, z
+    memory[top + 4], memory[top + 5], memory[top + 6] = u, v, w
+    if changed:
+        memory[_READY] = 0.0
+
+
+@inline_kernel
+def _integrate_newest(memory: FloatArray, k: int, dq: FloatArray, dv: FloatArray, ds: FloatArray) -> None:
+    """Integrals of the newest step from the polynomials through the window, into row `k`."""
+    m = int(memory[_SEEN])
+    if memory[_READY] != m:
+        steps = memory[_STEPS : _STEPS + m]
+        for i in range(m):
+            steps[i] = memory[_WINDOW + 7 * (MAX_WINDOW - m + i)]
+        weights = memory[_WEIGHTS:_STEPS].reshape((MAX_WINDOW, MAX_WINDOW))
+        _fit_weights(steps, m - 1, weights, memory[_TABLE:_COEFFICIENT])
+        memory[_READY] = m
+    coefficient = memory[_COEFFICIENT:MEMORY]
+    for j in range(m):
+        c0 = c1 = c2 = c3 = c4 = c5 = 0.0
+        for i in range(m):
+            weight = memory[_WEIGHTS + j * MAX_WINDOW + i]
+            here = _WINDOW + 7 * (MAX_WINDOW - m + i)
+            c0 += weight * memory[here + 1]
+            c1 += weight * memory[here + 2]
+            c2 += weight * memory[here + 3]
+            c3 += weight * memory[here + 4]
+            c4 += weight * memory[here + 5]
+            c5 += weight * memory[here + 6]
+        coefficient[6 * j], coefficient[6 * j + 1], coefficient[6 * j + 2] = c0, c1, c2
+        coefficient[6 * j + 3], coefficient[6 * j + 4], coefficient[6 * j + 5] = c3, c4, c5
+    _integrate_polynomial(coefficient, m, memory[_WINDOW + 7 * (MAX_WINDOW - 1)], k, dq, dv, ds)
 
 
 @kernel
@@ -321,9 +346,9 @@ def integrate_blocks(
     """
     n = step.shape[0]
     m = min(window, n)
-    coefficient = np.zeros((MAX_WINDOW, 6))
+    coefficient = np.zeros(6 * MAX_WINDOW)
     weights = np.empty((MAX_WINDOW, MAX_WINDOW, MAX_WINDOW))
-    fitted = np.zeros(MAX_WINDOW)
+    fitted, room = np.zeros(MAX_WINDOW), np.empty(2 * m * m)
     for block in range(0, n, m):
         first = min(block, n - m)
         changed = False
@@ -332,7 +357,7 @@ def integrate_blocks(
             fitted[i] = step[first + i]
         if changed:
             for place in range(m):
-                _fit_weights(fitted[:m], place, weights[place])
+                _fit_weights(fitted[:m], place, weights[place], room)
         for k in range(block, min(block + m, n)):
             place = k - first
             for j in range(m):
@@ -346,6 +371,6 @@ def integrate_blocks(
                     c3 += weight * dvel[row, 0]
                     c4 += weight * dvel[row, 1]
                     c5 += weight * dvel[row, 2]
-                coefficient[j, 0], coefficient[j, 1], coefficient[j, 2] = c0, c1, c2
-                coefficient[j, 3], coefficient[j, 4], coefficient[j, 5] = c3, c4, c5
+                coefficient[6 * j], coefficient[6 * j + 1], coefficient[6 * j + 2] = c0, c1, c2
+                coefficient[6 * j + 3], coefficient[6 * j + 4], coefficient[6 * j + 5] = c3, c4, c5
             _integrate_polynomial(coefficient, m, step[k], k, dq, dv, ds)

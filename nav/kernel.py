@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import numba
+from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -18,3 +19,17 @@ def inline_kernel(function: F) -> F:
     """Compile a small helper that is inlined into the kernels calling it (LLVM decides)."""
     compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)
     return compiled
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def float_pointer(context: Any, address: Any) -> Any:
+    """In a kernel: pointer to the floats at an address, for `numba.carray`.
+
+    An address reaches a kernel five times faster from Python than an array. Its array must outlive the call.
+    """
+    signature = numba.types.CPointer(numba.types.float64)(numba.types.intp)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return signature, generate

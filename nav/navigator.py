@@ -291,6 +291,7 @@ class Navigator:
             stop = start + used
         n = stop - start
         position, velocity, attitude = (array[:n] for array in self._scratch)
+        before = self._core.mechanization
         done = self._core.advance(
             imu.step[start:stop],
             imu.dtheta[start:stop],
@@ -302,9 +303,10 @@ class Navigator:
         )
         self._state[:] = self._core.solution
         if done < n:
-            raise HilError(
-                f"the geographic mechanization is singular at the pole: stopped at latitude "
-                f"{math.degrees(self._state[0]):.4f} deg"
+            self._say(
+                float(imu.time[start + done]),
+                "notice",
+                f"the {before} mechanization is singular at the pole: {self._core.mechanization} goes on",
             )
         part = rows[start:stop]
         part["mode"], part["health"] = self.mode, self.health

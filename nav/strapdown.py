@@ -5,17 +5,22 @@ and `high-order` the rotation comes from that method and the velocity and positi
 mechanization answers in the same terms: geodetic position, velocity in n, q_nb.
 """
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import numpy as np
 
 from nav import attitude as attitudes
-from nav.body_integrals import MAX_WINDOW, MEMORY, integrate_blocks, integrate_body
+from nav import step as kernels
+from nav.body_integrals import MAX_WINDOW, integrate_blocks, integrate_body
 from nav.earth import RATE
 from nav.errors import HilError
 from nav.gravitation import field_code
 from nav.increments import FloatArray
 from nav.mechanization import cartesian, geographic, wander
 
-MECHANIZATIONS = ("geographic", "wander", "earth", "inertial", "inertial-source")
+MECHANIZATIONS = kernels.MECHANIZATIONS
 ATTITUDES = (
     "two-sample",
     f"high-order[:N] (N = 3..{MAX_WINDOW})",
@@ -24,8 +29,14 @@ ATTITUDES = (
 """What there is, for messages and help."""
 
 
+Answers = tuple[FloatArray, FloatArray, FloatArray]
+"""Room for position, velocity and attitude."""
+
+
 class Strapdown:
     """See the module.
+
+    Near a pole `geographic` hands over to `wander`, which has no singular place.
 
     Parameters
     ----------
@@ -38,6 +49,18 @@ class Strapdown:
         ``normal`` or ``j2``.
     whole_record : bool
         `advance` is called once with a whole record: high order then works in blocks, to both sides, which is more exact.
+
+    Attributes
+    ----------
+    mechanization : str
+        The present one.
+    solution : (10,) float
+        Newest lat, lon, height, vel_n (3), q_nb (4).
+    push : callable
+        One sample: ``push(step, dtheta_x, dtheta_y, dtheta_z, dvel_x, dvel_y, dvel_z)`` with the gyro bias taken off; see
+        :func:`nav.step.push`. Its answer is `nav.step.DONE`, or ``POLE`` (`hand_over`, then push again) or ``NOT_FINITE``,
+        and then nothing has changed. Compiled from the moment that the polynomials have all their samples; fetch it anew
+        after `start`.
 
     Raises
     ------
@@ -57,31 +80,85 @@ class Strapdown:
             raise HilError(f"unknown mechanization {mechanization!r}; there is: {', '.join(MECHANIZATIONS)}")
         if mechanization == "inertial-source" and attitude != "two-sample":
             raise HilError(f"mechanization 'inertial-source' has its own attitude: it takes no {attitude!r}")
-        self._mechanization = mechanization
+        self._first = self.mechanization = mechanization
         self._field = field_code(gravity)
         self._window = _window(attitude)
         self._method = None if self._window else _method(attitude)
-        self._whole = whole_record
+        self._blocks = whole_record and self._window > 2
+        self._core = np.zeros(kernels.CORE)
+        self._core[kernels.FIELD], self._core[kernels.WINDOW] = self._field, self._window
+        self._memory, self._state = self._core[kernels.MEMORY_PART], self._core[kernels.STATE_PART]
+        self.solution = self._core[kernels.SOLUTION_PART][:10]
+        self._azimuth = self._core[kernels.SOLUTION_PART][10:]
         self._room(256)
         self.start(0.0, 0.0, 0.0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
-    def start(self, lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> None:
-        """Begin at a position (rad, m) with a velocity (3,), m/s, and an attitude (4,), and no increments before."""
-        self.solution = np.array([lat, lon, height, *vel_n, *q_nb])
-        """Newest lat, lon, height, vel_n (3), q_nb (4)."""
-        self.azimuth = 0.0
+    @property
+    def azimuth(self) -> float:
         """Wander azimuth A of the Y axis, rad; 0 in the other mechanizations."""
-        place = lat, lon, height, np.asarray(vel_n, float), np.asarray(q_nb, float)
-        if self._mechanization == "geographic":
-            self._state = geographic.start(*place)
-        elif self._mechanization == "wander":
-            self._state = wander.start(*place)
-        else:
-            self._state = cartesian.start(*place, RATE if self._mechanization == "earth" else 0.0)
-        self._memory = np.zeros(MEMORY)
-        self._previous = np.zeros(4)
+        return float(self._azimuth[0])
+
+    def start(
+        self, lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, azimuth: float = 0.0
+    ) -> None:
+        """Begin at a position (rad, m) with a velocity (3,), m/s, and an attitude (4,), and no increments before.
+
+        `azimuth` is that of the wander mechanization at the start, rad.
+        """
+        self.solution[:] = lat, lon, height, *vel_n, *q_nb
+        self._settle(self._first, azimuth)
+        self._memory[:] = 0.0
         self._q = np.array([1.0, 0.0, 0.0, 0.0])
         self._stream = None if self._method is None else self._method.stream(self._q)
+        young = self._window > 2 and not self._blocks
+        self._lead: list[FloatArray] | None = [] if young else None
+        self._origin = self._state.copy()
+        self.push: Callable[[float, float, float, float, float, float, float], int] = self._push_slowly
+        self._quicken()
+
+    def hand_over(self, mechanization: str, azimuth: float = 0.0) -> None:
+        """Go on in another mechanization, from the present solution and with the increments before.
+
+        Raises
+        ------
+        HilError
+            Unknown mechanization, or one of the two is ``inertial-source``, which keeps other memories.
+        """
+        if mechanization not in MECHANIZATIONS or "inertial-source" in (mechanization, self.mechanization):
+            raise HilError(f"no hand-over from {self.mechanization!r} to {mechanization!r}")
+        self._settle(mechanization, azimuth)
+        self._origin, self._lead = self._state.copy(), None if self._lead is None else []
+
+    def correct_azimuth(self, change: float) -> None:
+        """Correct the heading by `change`, rad, through the azimuth of the platform alone (Babich 2011).
+
+        The gyroscopic heading and the velocity in the platform's axes are taken as exact; both turn in n.
+
+        Raises
+        ------
+        HilError
+            The mechanization is not ``wander``.
+        """
+        if self.mechanization != "wander":
+            raise HilError(f"mechanization {self.mechanization!r} has no azimuth to correct: choose wander")
+        wander.correct_azimuth(self._state, change)
+        nothing = np.zeros(1), np.zeros((1, 4)), np.zeros((1, 3)), np.zeros((1, 3))
+        out = self.solution[None, 0:3], self.solution[None, 3:6], self.solution[None, 6:10]
+        wander.advance(self._state, self._field, *nothing, *out, self._azimuth)
+
+    def _settle(self, mechanization: str, azimuth: float) -> None:
+        lat, lon, height = (float(value) for value in self.solution[:3])
+        place = lat, lon, height, self.solution[3:6], self.solution[6:10]
+        if mechanization == "geographic":
+            state = geographic.start(*place)
+        elif mechanization == "wander":
+            state = wander.start(*place, azimuth)
+        else:
+            state = cartesian.start(*place, RATE if mechanization == "earth" else 0.0)
+        self._state[: len(state)] = state
+        self._azimuth[0] = azimuth if mechanization == "wander" else 0.0
+        self.mechanization = mechanization
+        self._core[kernels.CODE] = MECHANIZATIONS.index(mechanization)
 
     def advance(
         self,
@@ -93,7 +170,7 @@ class Strapdown:
         velocity: FloatArray,
         attitude: FloatArray,
     ) -> int:
-        """Take increments, fill the answers; the number of steps done.
+        """Take increments, fill the answers; the number of steps before a hand-over, n where there was none.
 
         Parameters
         ----------
@@ -106,64 +183,121 @@ class Strapdown:
         position, velocity, attitude : (n, 3), (n, 3), (n, 4) float
             Out: lat, lon (rad), height (m); vel_n (m/s); q_nb, at the end of each step.
 
-        Returns
-        -------
-        int
-            Fewer than n where the geographic mechanization stands before a pole.
+        Raises
+        ------
+        HilError
+            The answer is not a finite number: an increment was none.
         """
-        n = len(step)
-        if n == 0:
-            return 0
+        n = alone = len(step)
         if n > len(self._dq):
             self._room(2 * n)
-        if self._mechanization == "inertial-source":
-            raw = dtheta - gyro_bias * step[:, None] if gyro_bias.any() else dtheta
-            out = position, velocity, attitude
-            done = cartesian.advance_source(self._state, self._field, step, raw, dvel, self._previous, *out)
+        out = position, velocity, attitude
+        done = 0
+        while done < n and self._lead is not None:
+            one = slice(done, done + 1)
+            there = position[one], velocity[one], attitude[one]
+            if not self._advance(step[one], dtheta[one], dvel[one], gyro_bias, there):
+                alone = done
+            self._lead_in(self._lead, step[done], dtheta[done] - gyro_bias * step[done], dvel[done], there)
+            done += 1
+        if done < n:
+            there = position[done:], velocity[done:], attitude[done:]
+            alone = min(alone, done + self._advance(step[done:], dtheta[done:], dvel[done:], gyro_bias, there))
+        if n and not np.isfinite(self.solution).all():
+            bad = int(np.flatnonzero(~np.isfinite(np.hstack(out)).all(axis=1))[0])
+            raise HilError(f"strapdown: increment {bad} of the batch is not a number, or too large to be one")
+        return alone
+
+    def _advance(
+        self, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, gyro_bias: FloatArray, out: Answers
+    ) -> int:
+        n = len(step)
+        body = self._dq[:n], self._dv[:n], self._ds[:n]
+        code, azimuths = MECHANIZATIONS.index(self.mechanization), self._azimuths[:n]
+        if self._stream is None and (step.all() or not self._blocks):
+            how = code, self._field, self._window, self._blocks
+            work = self._memory, self._state, gyro_bias
+            done = int(kernels.advance(*how, *work, step, dtheta, dvel, *body, *out, azimuths))
         else:
-            self._body(step, dtheta, dvel, gyro_bias)
-            body = step, self._dq[:n], self._dv[:n], self._ds[:n]
-            out = position, velocity, attitude
-            if self._mechanization == "geographic":
-                done = geographic.advance(self._state, self._field, *body, *out)
-            elif self._mechanization == "wander":
-                done = wander.advance(self._state, self._field, *body, *out, self._azimuths[:n])
-                self.azimuth = float(self._azimuths[n - 1])
-            else:
-                turn = RATE if self._mechanization == "earth" else 0.0
-                done = cartesian.advance(self._state, self._field, turn, *body, *out)
-        if done:
-            self.solution[0:3], self.solution[3:6] = position[done - 1], velocity[done - 1]
-            self.solution[6:10] = attitude[done - 1]
-        return int(done)
+            if self._stream is not None:
+                integrate_body(self._memory, 2, step, dtheta, dvel, gyro_bias, *body)
+                self._turn(self._stream, step, dtheta - gyro_bias * step[:, None])
+            else:  # steps of zero have no place in a polynomial
+                moving = step > 0.0
+                some = tuple(np.zeros((int(moving.sum()), array.shape[1])) for array in body)
+                if moving.any():
+                    integrate_blocks(self._window, step[moving], dtheta[moving], dvel[moving], gyro_bias, *some)
+                for array, part in zip(body, some, strict=True):
+                    array[:] = 0.0
+                    array[moving] = part
+            done = int(kernels.mechanize(code, self._field, self._state, step, *body, *out, azimuths))
+        self._keep(done, out)
+        if done < n:
+            self.hand_over("wander")
+            rest = [array[done:] for array in (step, *body, *out, azimuths)]
+            kernels.mechanize(MECHANIZATIONS.index("wander"), self._field, self._state, *rest)
+            self._keep(n, out)
+        return done
+
+    def _keep(self, n: int, out: Answers) -> None:
+        if n:
+            self.solution[0:3], self.solution[3:6], self.solution[6:10] = (array[n - 1] for array in out)
+            if self.mechanization == "wander":
+                self._azimuth[0] = self._azimuths[n - 1]
+
+    def _lead_in(self, lead: list[FloatArray], step: float, dtheta: FloatArray, dvel: FloatArray, out: Answers) -> None:
+        """The first samples were taken with less than the full order: when the window is full, take them again as a block."""
+        if step > 0.0:
+            lead.append(np.array([step, *dtheta, *dvel]))
+        n = len(lead)
+        if n < self._window:
+            return
+        rows = np.array(lead)
+        data = [np.ascontiguousarray(part) for part in (rows[:, 0], rows[:, 1:4], rows[:, 4:7])]
+        again = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
+        body = self._dq[:n], self._dv[:n], self._ds[:n]
+        self._state[:] = self._origin
+        how = MECHANIZATIONS.index(self.mechanization), self._field, self._window, True
+        work = self._memory, self._state, np.zeros(3)
+        kernels.advance(*how, *work, data[0], data[1], data[2], *body, *again, self._azimuths[:n])
+        self._keep(n, again)
+        for array, value in zip(out, again, strict=True):
+            array[0] = value[-1]
+        self._lead = None
+        self._quicken()
+
+    def _quicken(self) -> None:
+        """Let `push` be the compiled one."""
+        if self._lead is None and self._stream is None and not self._blocks:
+            self.push = partial(_entry(), self._core.ctypes.data)
+
+    def _push_slowly(self, step: float, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> int:
+        if not np.isfinite(step + x + y + z + vx + vy + vz):
+            return kernels.NOT_FINITE
+        one = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 4))
+        self.advance(np.array([step]), np.array([[x, y, z]]), np.array([[vx, vy, vz]]), np.zeros(3), *one)
+        return kernels.DONE
 
     def _room(self, n: int) -> None:
         self._dq, self._dv, self._ds = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3))
         self._azimuths = np.zeros(n)
 
-    def _body(self, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, gyro_bias: FloatArray) -> None:
+    def _turn(self, stream: attitudes.AttitudeStream, step: FloatArray, dtheta: FloatArray) -> None:
+        """Replace the rotation by that of the attitude method."""
         n = len(step)
-        out = self._dq[:n], self._dv[:n], self._ds[:n]
-        if self._whole and self._window > 2:
-            moving = step > 0.0  # steps of zero have no place in a polynomial
-            if moving.all():
-                integrate_blocks(self._window, step, dtheta, dvel, gyro_bias, *out)
-                return
-            some = tuple(np.zeros((int(moving.sum()), array.shape[1])) for array in out)
-            if moving.any():
-                integrate_blocks(self._window, step[moving], dtheta[moving], dvel[moving], gyro_bias, *some)
-            for array, part in zip(out, some, strict=True):
-                array[:] = 0.0
-                array[moving] = part
-            return
-        integrate_body(self._memory, self._window or 2, step, dtheta, dvel, gyro_bias, *out)
-        if self._stream is not None:
-            raw = dtheta - gyro_bias * step[:, None] if gyro_bias.any() else dtheta
-            rows = np.empty((n, 4))
-            self._stream.push(step, np.ascontiguousarray(raw), rows)
-            before = np.concatenate([self._q[None], rows[:-1]])
-            self._dq[:n] = _turns(before, rows)
-            self._q = rows[-1].copy()
+        rows = np.empty((n, 4))
+        stream.push(step, np.ascontiguousarray(dtheta), rows)
+        before = np.concatenate([self._q[None], rows[:-1]])
+        self._dq[:n] = _turns(before, rows)
+        self._q = rows[-1].copy()
+
+
+def _entry() -> Any:
+    """The compiled `push` without numba's dispatcher, which costs as much as the step."""
+    kernel: Any = kernels.push
+    if not kernel.signatures:
+        kernel(np.zeros(kernels.CORE).ctypes.data, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return next(iter(kernel.overloads.values())).entry_point
 
 
 def _turns(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -190,12 +324,12 @@ def _method(attitude: str) -> attitudes.AttitudeMethod:
 
 def _window(attitude: str) -> int:
     """Samples of the polynomial of an integrated method; 0 for a method of `nav.attitude`."""
-    name, _, count = attitude.partition(":")
+    name, colon, count = attitude.partition(":")
     if attitude == "two-sample":
         return 2
     if name != "high-order":
         return 0
-    if not count:
+    if not colon:
         return 4
     if not count.isdecimal() or not 3 <= int(count) <= MAX_WINDOW:
         raise HilError(f"attitude method {attitude!r}: high-order:N takes N = 3..{MAX_WINDOW}")

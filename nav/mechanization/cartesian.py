@@ -18,16 +18,17 @@ from nav.gravitation import gravitation_cartesian, near_latitude
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
 
-STATE = 25
+STATE = 29
 """r (3) | v (3) | q (4) | rounding left of r (3) and q (4) | gravitation at the last mid-step (3), its step | sine, cosine
-of the latitude | time since the axes of i and e coincided, what rounding left of it."""
-_LOW_R, _LOW_Q, _G, _G_STEP, _LAT, _TIME = 10, 13, 17, 20, 21, 23
+of the latitude | time since the axes of i and e coincided, what rounding left of it | the increment before (3), its step."""
+_LOW_R, _LOW_Q, _G, _G_STEP, _LAT, _TIME, _PREVIOUS = 10, 13, 17, 20, 21, 23, 25
 
 
 def start(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, turn_rate: float) -> FloatArray:
     """State vector of the inertial (`turn_rate` = 0) or Earth-fixed (`turn_rate` = RATE) mechanization.
 
-    Parameters as in :func:`nav.mechanization.geographic.start`. The inertial axes are those of e now.
+    Parameters as in :func:`nav.mechanization.geographic.start`. The inertial axes are those of e now; for others, shift the
+    longitude by the turn since.
     """
     state = np.zeros(STATE)
     sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat), math.cos(lat), math.sin(lon), math.cos(lon)
@@ -251,7 +252,7 @@ def advance_source(
     step: FloatArray,
     dtheta: FloatArray,
     dvel: FloatArray,
-    previous: FloatArray,
+    gyro_bias: FloatArray,
     position: FloatArray,
     velocity: FloatArray,
     attitude: FloatArray,
@@ -259,17 +260,18 @@ def advance_source(
     """Inertial mechanization as source 000 prints it (Uspensky & Bagmut 2009, eqs. 13-17); first order in the step.
 
     ``dV = C (dv + dth x dv / 2) + g(R) T``, ``R += (V + V') T / 2``, attitude by Picard 3 with the source's scaling of the
-    previous increment. `state` as of `start` with turn rate 0; `dtheta` and `dvel` are raw increments; `previous` (4,) is
-    the increment and the step before, zeros at the start.
+    previous increment. `state` as of `start` with turn rate 0; `dtheta` and `dvel` are raw increments, `gyro_bias` (3,) is
+    taken off the rate.
     """
     rx, ry, rz = state[0], state[1], state[2]
     vx, vy, vz = state[3], state[4], state[5]
     a, b, c, d = state[6], state[7], state[8], state[9]
     sin_lat, cos_lat, time = state[_LAT], state[_LAT + 1], state[_TIME]
+    previous = state[_PREVIOUS : _PREVIOUS + 4]
     for k in range(step.shape[0]):
         t = step[k]
         if t > 0.0:
-            x, y, z = dtheta[k, 0], dtheta[k, 1], dtheta[k, 2]
+            x, y, z = dtheta[k, 0] - gyro_bias[0] * t, dtheta[k, 1] - gyro_bias[1] * t, dtheta[k, 2] - gyro_bias[2] * t
             ux, uy, uz = cross(x, y, z, dvel[k, 0], dvel[k, 1], dvel[k, 2])
             ux, uy, uz = dvel[k, 0] + 0.5 * ux, dvel[k, 1] + 0.5 * uy, dvel[k, 2] + 0.5 * uz
             px, py, pz = cross(b, c, d, ux, uy, uz)

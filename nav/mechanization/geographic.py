@@ -6,7 +6,7 @@ off it exactly; what is left moves latitude, longitude and height along the chor
 by the rotation of latitude and longitude. Every part is exact but for terms of third order in step / Earth radius and in the
 change of gravitation, far below what the sensors' polynomial leaves; so the order is that of the body integrals.
 
-Singular at the poles: stops before a step that starts within `POLAR_CAP` of one.
+Singular at the poles: stops before a step that starts beyond `MAX_LAT`.
 """
 
 import math
@@ -19,8 +19,8 @@ from nav.gravitation import gravitation_local
 from nav.increments import FloatArray
 from nav.kernel import kernel
 
-POLAR_CAP = 1e-3
-"""cos(lat) below which the mechanization refuses to go on (6.4 km from the pole)."""
+MAX_LAT = math.acos(1e-3)
+"""Latitude beyond which no step starts, rad (6.4 km from the pole)."""
 STATE = 16
 """lat, lon, height | vel_n (3) | q_nb (4) | what rounding left of lat, lon, q_nb, carried to the next step."""
 
@@ -76,10 +76,10 @@ def advance(
     done = len(step)
     for k in range(step.shape[0]):
         t = step[k]
-        sin_lat, cos_lat = math.sin(lat), math.cos(lat)
-        if cos_lat < POLAR_CAP:
+        if abs(lat) > MAX_LAT:
             done = k
             break
+        sin_lat, cos_lat = math.sin(lat), math.cos(lat)
         if t > 0.0:
             # Body integrals in the axes of n at the step's start.
             x, y, z = dv[k, 0], dv[k, 1], dv[k, 2]

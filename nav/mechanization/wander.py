@@ -40,6 +40,16 @@ def start(
     return state
 
 
+def correct_azimuth(state: FloatArray, change: float) -> None:
+    """Correct A by `change`, rad, and nothing else: Babich's correction of the heading.
+
+    The gyroscopic heading psi_r and the velocity in w are taken as exact; in n both turn with A.
+    """
+    q_turn = np.array([math.cos(0.5 * change), 0.0, 0.0, -math.sin(0.5 * change)])
+    state[0:4] = _multiply(state[0:4], q_turn)
+    state[12:16] = 0.0
+
+
 @inline_kernel
 def _field(field: int, kx: float, ky: float, kz: float, height: float, prime: float) -> tuple[float, float, float]:
     """Gravitation in w axes."""

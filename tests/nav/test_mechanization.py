@@ -13,7 +13,6 @@ from hil.scenario import load
 from hil.world.motion import Motion
 from nav.earth import RATE, normal_gravity
 from nav.errors import HilError
-from nav.mechanization.geographic import POLAR_CAP
 from nav.navigator import Navigator, Settings
 from nav.rotation import attitude_error
 from nav.strapdown import Strapdown
@@ -175,19 +174,6 @@ def test_longitude_is_a_symmetry(turn):
     assert (np.abs(position[:, 1]) <= math.pi).all()
     assert math.remainder(other.solution[1] - one.solution[1] - turn, 2 * math.pi) == pytest.approx(0.0, abs=1e-14)
     np.testing.assert_array_equal(np.delete(one.solution, 1), np.delete(other.solution, 1))
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_the_polar_cap_is_refused_not_crossed(sign):
-    lat = sign * math.acos(1.001 * POLAR_CAP)
-    core = started(lat, 0.0, 0.0, np.array([sign * 100.0, 0, 0]), np.array([1.0, 0, 0, 0]))
-    n = 1000
-    force = np.tile([0.0, 0.0, -9.832], (n, 1))
-    done, position, *_ = run(core, np.full(n, 0.01), np.zeros((n, 3)), 0.01 * force)
-    assert 1 < done < n
-    assert np.isnan(position[done:]).all()
-    assert np.isfinite(position[:done]).all()
-    assert math.cos(position[done - 1, 0]) < POLAR_CAP <= math.cos(position[done - 2, 0])
 
 
 @pytest.mark.parametrize(
