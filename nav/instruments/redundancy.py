@@ -101,7 +101,7 @@ def combination(h: FloatArray, weights: FloatArray) -> FloatArray | None:
     normal = (h.T * weights) @ h
     if np.linalg.cond(normal) > 1e9:
         return None
-    solution: FloatArray = np.linalg.solve(normal, h.T * weights)
+    solution: FloatArray = np.linalg.inv(normal) @ (h.T * weights)
     return solution
 
 
