@@ -37,7 +37,9 @@ class Validity(IntFlag):
     BRIDGED = 2
     """Made up over a gap longer than the policy interpolates: attitude and velocity are no longer trusted."""
     SENSOR = 4
-    """The sensor itself flags the sample (built-in test, saturation)."""
+    """An instrument that the solution needs has failed, by its own test or by ours, or is saturated."""
+    SPARE = 8
+    """An instrument has failed that the solution does not need: there is none to spare any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,9 @@ class HeadIncrements:
         Rotor tilt angles of the same axes at the end of the step, rad; NaN where the wire does not carry them.
     dvel : (n, 3) float
         Velocity increments along x, y, z, m/s.
+    status : (n,) int
+        What the head says of itself: bit 0 fault of gyro 1, 1 of gyro 2, 2..4 of the x, y, z accelerometer; others as its
+        driver documents.
     """
 
     time: FloatArray
@@ -118,6 +123,7 @@ class HeadIncrements:
     dvel: FloatArray
     validity: IntArray
     sequence: IntArray
+    status: IntArray
 
     def __len__(self) -> int:
         return len(self.time)
@@ -132,6 +138,7 @@ class HeadIncrements:
             self.dvel[start:stop],
             self.validity[start:stop],
             self.sequence[start:stop],
+            self.status[start:stop],
         )
 
     @staticmethod
@@ -143,6 +150,7 @@ class HeadIncrements:
             np.zeros((n, 4)),
             np.zeros((n, 4)),
             np.zeros((n, 3)),
+            np.zeros(n, np.int64),
             np.zeros(n, np.int64),
             np.zeros(n, np.int64),
         )

@@ -27,6 +27,7 @@ Severity = Literal["info", "notice", "warning", "error"]
 
 DISTRUST = Health.SILENT | Health.BRIDGED | Health.SENSOR
 """Health that makes the mode DEGRADED."""
+_FLAGS = int(Validity.SENSOR | Validity.SPARE)
 _LAT, _LON, _HEIGHT, _VEL, _Q = slice(0, 1), slice(1, 2), slice(2, 3), slice(3, 6), slice(6, 10)
 REST_WINDOW_S = 2.0
 """Length of the windows in which the bias is tracked at rest, s."""
@@ -100,6 +101,7 @@ class Navigator:
         self.health = Health.GOOD if settings.position_trusted else Health.UNAIDED
         self.gyro_bias = np.zeros(3)
         self.heading = settings.heading
+        self._flagged = 0
         self._filler = GapFiller(settings.gaps)
         self._sums = np.zeros(rest.SUMS)
         self._state = _solution(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
@@ -219,14 +221,14 @@ class Navigator:
         return self._rows[1 : n + 1]
 
     def _run(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> None:
-        flags = imu.validity & Validity.SENSOR if imu.validity[start:stop].any() else None
+        flags = imu.validity & _FLAGS if imu.validity[start:stop].any() else None
         while start < stop:
             end = stop
-            flagged = flags is not None and bool(flags[start])
+            flagged = 0 if flags is None else int(flags[start])
             if flags is not None:  # up to the next change of the sensor's own flag
                 changes = np.flatnonzero(flags[start:stop] != flags[start])
                 end = start + int(changes[0]) if len(changes) else stop
-            if flagged != bool(self.health & Health.SENSOR):
+            if flagged != self._flagged:
                 self._flag(float(imu.time[start]), flagged)
             start += (self._align if self.mode == Mode.ALIGN else self._navigate)(imu, rows, start, end)
 
@@ -317,10 +319,13 @@ class Navigator:
             self._track_bias()
         return n
 
-    def _flag(self, time: float, flagged: bool) -> None:
-        self.health ^= Health.SENSOR
-        if flagged:
+    def _flag(self, time: float, flagged: int) -> None:
+        if flagged & ~self._flagged & Validity.SENSOR:
             self._say(time, "error", "the sensor flags its own samples: see its built-in test")
+        self._flagged = flagged
+        self.health &= ~(Health.SENSOR | Health.SPARE)
+        self.health |= Health.SENSOR if flagged & Validity.SENSOR else Health.GOOD
+        self.health |= Health.SPARE if flagged & Validity.SPARE else Health.GOOD
         self._trust(time)
 
     def _track_bias(self) -> None:

@@ -27,7 +27,7 @@ class Health(IntFlag):
     BRIDGED = 2
     """A gap longer than the policy interpolates was bridged since the last alignment."""
     SENSOR = 4
-    """The sensor flags its own samples."""
+    """An instrument that the solution needs has failed or is saturated."""
     MOVING = 8
     """Alignment waits: the vehicle moves."""
     UNITS = 16
@@ -36,6 +36,8 @@ class Health(IntFlag):
     """The Earth rate is below the sensor's noise or there is no horizontal part: heading must be given."""
     UNAIDED = 64
     """Position and velocity of this grade of sensor cannot be trusted without aiding."""
+    SPARE = 128
+    """A redundant instrument has failed: the solution is good, but there is none to spare."""
 
 
 NAV_STATE = np.dtype(

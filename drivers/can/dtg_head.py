@@ -25,6 +25,8 @@ FAULTS = 0x03FF
 """Status bits that make a sample suspect."""
 ROTOR_VALID = 0x8000
 """Status bit: the rotor angles are there."""
+_BUILT_IN = ("bit_g1", "bit_g2", "bit_ax", "bit_ay", "bit_az")
+"""Signals of HEAD_BIT, in the order of the status bits that say the same."""
 WINDOW = 64
 """How far back a sample counts as late or duplicate rather than as a restart."""
 
@@ -177,6 +179,7 @@ class DtgHead:
         self.period_s: float | None = None
         self.world_id = 0
         self._identity: dict[str, object] = {}
+        self._built_in = 0
         self._state = np.zeros(7, np.int64)
         self._outcome = np.zeros(7, np.int64)
         self._partial = np.zeros((6, 8), np.uint8)
@@ -251,6 +254,10 @@ class DtgHead:
         invalid = (kept[:, _STATUS].astype(np.int64) & ROTOR_VALID) == 0
         if invalid.any():
             result.rotor[invalid] = np.nan
+        result.status[:] = kept[:, _STATUS]
+        if self._built_in:
+            result.status[:] |= self._built_in
+            result.validity[:] |= Validity.SENSOR.value
         self._arrivals = times[rows]
         counters, outcome = self.counters, self._outcome
         counters.samples, counters.lost, counters.late = (
@@ -296,6 +303,8 @@ class DtgHead:
             self.world_id = int(said["world_id"])
             self._state[_PERIOD_US] = int(said["sample_period"])
             self.period_s = said["sample_period"] * 1e-6
+        if codec.name == "HEAD_BIT":
+            self._built_in = sum(1 << k for k, name in enumerate(_BUILT_IN) if said[name])
         self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
 
     def _classic_samples(self, batch: FrameArray, periods: IntArray) -> HeadIncrements:

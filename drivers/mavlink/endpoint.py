@@ -42,6 +42,7 @@ _HEALTH_TEXT = {
     Health.MOVING: (mav.MAV_SEVERITY_NOTICE, "Alignment waits: the vehicle moves"),
     Health.UNITS: (mav.MAV_SEVERITY_ERROR, "Specific force at rest is not 1 g"),
     Health.RATE_TOO_SMALL: (mav.MAV_SEVERITY_WARNING, "Cannot find north: heading must be given"),
+    Health.SPARE: (mav.MAV_SEVERITY_WARNING, "A redundant instrument has failed"),
     Health.UNAIDED: (mav.MAV_SEVERITY_NOTICE, "Position is not aided and drifts"),
 }
 

@@ -111,6 +111,16 @@ def _fill_increments(
         dvel[row, 0], dvel[row, 1], dvel[row, 2] = vx, vy, vz
 
 
+@kernel
+def _fill_sampled(plan: Plan, first: int, step: float, step_high: float, force: FloatArray, rate: FloatArray) -> None:
+    for row in range(len(force)):
+        k = first + row
+        whole = k * step
+        s = state_at(plan, whole, (k * step_high - whole) + k * (step - step_high))
+        rate[row, 0], rate[row, 1], rate[row, 2] = s.wx, s.wy, s.wz
+        force[row, 0], force[row, 1], force[row, 2] = s.fx, s.fy, s.fz
+
+
 class Motion:
     """A motion, compiled.
 
@@ -187,6 +197,28 @@ class Motion:
         _fill_increments(self._plan, rule, self._arm, first, step, high_bits(step), dtheta, dvel)
         if not (math.isfinite(dtheta.sum()) and math.isfinite(dvel.sum())):
             bad = ~np.isfinite(dtheta + dvel).all(axis=1)
+            raise _lost((first + int(bad.argmax())) * step)
+
+    def sampled(self, first: int, step: float, force: FloatArray, rate: FloatArray) -> None:
+        """Specific force and body rate at the times k * step, k from `first`.
+
+        Parameters
+        ----------
+        first : int
+            The first k.
+        step : float
+            s.
+        force, rate : (n, 3) array, filled
+            ``f_b`` at the navigated point, m/s^2, and ``w_ib_b``, rad/s.
+
+        Raises
+        ------
+        HilError
+            A coordinated path stands still.
+        """
+        _fill_sampled(self._plan, first, step, high_bits(step), force, rate)
+        if not (math.isfinite(force.sum()) and math.isfinite(rate.sum())):
+            bad = ~np.isfinite(force + rate).all(axis=1)
             raise _lost((first + int(bad.argmax())) * step)
 
 

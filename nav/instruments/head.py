@@ -1,46 +1,249 @@
-"""From the raw increments of a dual-DTG head to increments of one IMU in body axes.
+"""From the raw increments of a dual-DTG head to those of one IMU in body axes.
 
-The instrument is taken as ideal: rates as they are, the two y axes averaged, head axes turned into body axes. Lag
-compensation and parity have their seat here, before the combination.
+    lag of the gyros taken off -> tests, parity, combination of the four axes -> size effect -> body axes
+
+A failed axis is left out from the sample after the one that shows it. What the layout cannot spare is said, and the sample
+flagged: an attitude of what is left, zero about the axis that nobody measures, is better than none.
 """
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from nav.increments import FloatArray, HeadIncrements, ImuIncrements
+from nav.increments import FloatArray, HeadIncrements, ImuIncrements, Validity
+from nav.instruments import redundancy
+from nav.instruments.dtg import Rotor
+from nav.instruments.dtg_compensation import LagCompensator
+from nav.instruments.pendulum import Pendulum
+from nav.instruments.redundancy import AXES, Fault, Limits
+from nav.instruments.size_effect import MEMORY as SIZE_MEMORY
+from nav.instruments.size_effect import compensate as take_off_size_effect
+from nav.instruments.size_effect import size_coefficients
 from nav.kernel import kernel
+
+_LOST = Fault.STUCK | Fault.NOISE | Fault.SATURATED | Fault.BUILT_IN
+_STATUS_AXES = ((0, 1), (2, 3), (4,), (5,), (6,))
+"""Axes of the status bits 0..4."""
+SPEED_TOLERANCE = 0.01
+"""A rotor speed off by more than this share is a failed gyro."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeadModel:
+    """What a head is taken for.
+
+    Attributes
+    ----------
+    c_bh : (3, 3) float
+        Mounting: takes head axes to body axes.
+    skew : float
+        How far each gyro is turned about its spin axis, rad; see :mod:`nav.instruments.redundancy`.
+    rotors : pair of Rotor, optional
+        What G1 and G2 send lags by these; None: they send true rates.
+    pendulums : sequence of Pendulum
+        Their size effect is taken off; none: there is none.
+    limits : Limits
+        What healthy instruments do.
+    """
+
+    c_bh: FloatArray
+    skew: float = 0.0
+    rotors: tuple[Rotor, Rotor] | None = None
+    pendulums: Sequence[Pendulum] = ()
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something that the user is told of an instrument."""
+
+    time: float
+    bad: bool
+    text: str
 
 
 @kernel
 def _combine(
-    head_dtheta: FloatArray, head_dvel: FloatArray, c_bh: FloatArray, dtheta: FloatArray, dvel: FloatArray
+    gyro: FloatArray, dvel: FloatArray, inverse: FloatArray, flag: int, dtheta: FloatArray, validity: FloatArray
 ) -> None:
-    for k in range(head_dtheta.shape[0]):
-        x, y = head_dtheta[k, 0], 0.5 * (head_dtheta[k, 1] + head_dtheta[k, 2])
-        z = head_dtheta[k, 3]
-        u, v, w = head_dvel[k, 0], head_dvel[k, 1], head_dvel[k, 2]
+    for k in range(gyro.shape[0]):
+        a, b, c, d = gyro[k, 0], gyro[k, 1], gyro[k, 2], gyro[k, 3]
         for i in range(3):
-            dtheta[k, i] = c_bh[i, 0] * x + c_bh[i, 1] * y + c_bh[i, 2] * z
-            dvel[k, i] = c_bh[i, 0] * u + c_bh[i, 1] * v + c_bh[i, 2] * w
+            dtheta[k, i] = inverse[i, 0] * a + inverse[i, 1] * b + inverse[i, 2] * c + inverse[i, 3] * d
+        validity[k] |= flag
+
+
+@kernel
+def _turn(c_bh: FloatArray, vectors: FloatArray) -> None:
+    """Head axes to body axes, in place."""
+    for k in range(vectors.shape[0]):
+        x, y, z = vectors[k, 0], vectors[k, 1], vectors[k, 2]
+        for i in range(3):
+            vectors[k, i] = c_bh[i, 0] * x + c_bh[i, 1] * y + c_bh[i, 2] * z
 
 
 class HeadCombiner:
-    """Turns `HeadIncrements` into `ImuIncrements`.
+    """Turns `HeadIncrements` into `ImuIncrements`; how a stream is split into batches changes no bit.
 
     Parameters
     ----------
-    c_bh : (3, 3) float
-        Mounting: takes head axes to body axes.
+    model : HeadModel
+        The head.
+
+    Attributes
+    ----------
+    faults : (7,) int
+        `Fault` of each of `nav.instruments.redundancy.AXES`.
     """
 
-    def __init__(self, c_bh: FloatArray) -> None:
-        self._c_bh = np.ascontiguousarray(c_bh, dtype=float)
-        self._imu = ImuIncrements.empty(256)
+    def __init__(self, model: HeadModel) -> None:
+        self._c_bh = np.ascontiguousarray(model.c_bh, dtype=float)
+        self._h = redundancy.layout(model.skew)
+        self._pair = math.sin(model.skew) == 0.0
+        self._rotors = model.rotors
+        self._lag = None if model.rotors is None else LagCompensator(*model.rotors)
+        self._size = size_coefficients(model.pendulums) if model.pendulums else None
+        self._size_memory = np.zeros(SIZE_MEMORY)
+        limits = model.limits
+        self._limits = (
+            *(limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale),
+            *(limits.gyro_range, limits.accelerometer_range),
+        )
+        self._notes: list[Note] = []
+        self._status, self._slow_rotors = 0, 0
+        self.faults = np.zeros(7, np.int64)
+        self._room(256)
+        self.renew()
+
+    def renew(self) -> None:
+        """Forget all faults and begin the tests anew."""
+        self.faults[:] = 0
+        self._memory = redundancy.fresh_memory()
+        self._status = 0
+        self._weigh()
+
+    def notes(self) -> list[Note]:
+        """What happened since the last call."""
+        notes, self._notes = self._notes, []
+        return notes
 
     def combine(self, head: HeadIncrements) -> ImuIncrements:
-        """The batch in body axes; valid until the next call."""
+        """The batch in body axes; valid until the next call.
+
+        Raises
+        ------
+        HilError
+            An increment is not finite.
+        """
         n = len(head)
         if n > len(self._imu):
-            self._imu = ImuIncrements.empty(2 * n)
-        dtheta, dvel = self._imu.dtheta[:n], self._imu.dvel[:n]
-        _combine(head.dtheta, head.dvel, self._c_bh, dtheta, dvel)
-        return ImuIncrements(head.time, head.step, dtheta, dvel, head.validity, head.sequence)
+            self._room(2 * n)
+        gyro, dtheta, dvel = self._gyro[:n], self._imu.dtheta[:n], self._imu.dvel[:n]
+        validity = self._imu.validity[:n]
+        if self._lag is None:
+            gyro[:] = head.dtheta
+        else:
+            self._lag.compensate(head, gyro)
+        dvel[:], validity[:] = head.dvel, head.validity
+        start = 0
+        while start < n:
+            stop = self._until_status_changes(head, start)
+            before = self.faults.copy()
+            done = redundancy.examine(
+                self._memory,
+                self.faults,
+                head.time[start:stop],
+                head.step[start:stop],
+                head.dtheta[start:stop],
+                gyro[start:stop],
+                head.dvel[start:stop],
+                self._parity,
+                self._limits,
+                self._pair,
+                self._residual[start:stop],
+            )
+            part = slice(start, start + done)
+            _combine(gyro[part], dvel[part], self._inverse, self._flag, dtheta[part], validity[part])
+            start += done
+            if (self.faults != before).any():
+                self._tell(float(head.time[start - 1]), before)
+        if self._size is not None:
+            take_off_size_effect(self._size_memory, self._size, head.step, dtheta, dvel, dvel)
+        _turn(self._c_bh, dtheta)
+        _turn(self._c_bh, dvel)
+        return ImuIncrements(head.time, head.step, dtheta, dvel, validity, head.sequence)
+
+    def rotor_speeds(self, time: float, *speeds: float) -> None:
+        """What the head says of the speeds of G1 and G2, rad/s; a wrong one is a failed gyro."""
+        if self._rotors is None:
+            return
+        wrong = sum(
+            1 << k
+            for k, (rotor, speed) in enumerate(zip(self._rotors, speeds, strict=True))
+            if abs(speed / rotor.spin - 1.0) > SPEED_TOLERANCE
+        )
+        if wrong != self._slow_rotors:
+            self._slow_rotors = wrong
+            self._take_status(time, self._status)
+
+    def _until_status_changes(self, head: HeadIncrements, start: int) -> int:
+        """End of the samples from `start` on with one status; what it says is taken first."""
+        status = head.status[start:] & 0x1F
+        if status[0] != self._status:
+            self._take_status(float(head.time[start]), int(status[0]))
+        changes = np.flatnonzero(status != status[0])
+        return start + int(changes[0]) if len(changes) else len(head)
+
+    def _take_status(self, time: float, status: int) -> None:
+        before, self._status = self.faults.copy(), status
+        self.faults &= ~Fault.BUILT_IN.value
+        for bit, axes in enumerate(_STATUS_AXES):
+            if (status | self._slow_rotors) & 1 << bit:
+                self.faults[list(axes)] |= Fault.BUILT_IN.value
+        if (self.faults != before).any():
+            self._tell(time, before)
+
+    def _weigh(self) -> None:
+        """Leave out what is lost."""
+        gyros = self.faults[:4]
+        lost = (gyros & _LOST.value) != 0
+        suspects = (gyros & Fault.PARITY.value) != 0
+        doubt = bool((suspects & ~lost).sum() > 1 and not (suspects & lost).any())
+        if not doubt:
+            lost |= suspects & ~(suspects & lost).any()
+        inverse = redundancy.combination(self._h, np.where(lost, 0.0, 1.0))
+        bad = inverse is None or doubt or bool((self.faults[4:] & _LOST.value).any())
+        self._flag = int(Validity.SENSOR) if bad else int(Validity.SPARE) if lost.any() else 0
+        # What is left, and nothing about the axis that nobody measures.
+        self._inverse = inverse if inverse is not None else np.linalg.pinv(np.where(lost[:, None], 0.0, self._h))
+        self._parity = np.zeros(4) if lost.any() else redundancy.parity_vector(self._h)
+        self._doubt, self._spans = doubt, inverse is not None
+
+    def _tell(self, time: float, before: np.ndarray) -> None:
+        self._weigh()
+        parity = [AXES[k] for k in range(4) if self.faults[k] & ~before[k] & Fault.PARITY.value]
+        for k in np.flatnonzero(self.faults != before):
+            found = Fault(int(self.faults[k] & ~before[k]))
+            name = AXES[k]
+            if not self.faults[k] and not found:
+                self._notes.append(Note(time, False, f"axis {name} is good again"))
+            elif found and not (found == Fault.PARITY and self._doubt):
+                what = str(found.name).lower().replace("_", "-").replace("|", " and ")
+                self._notes.append(Note(time, True, f"axis {name}: {what}; {self._consequence(int(k))}"))
+        if parity and self._doubt:
+            self._notes.append(
+                Note(time, True, f"{' and '.join(parity)} disagree, and nothing tells which is wrong: attitude is not to be trusted")
+            )
+
+    def _consequence(self, axis: int) -> str:
+        if axis > 3:
+            return "velocity and position are not to be trusted"
+        if self._spans:
+            return "the others carry on, none is left to spare"
+        return "no other axis measures its rate: attitude is not to be trusted"
+
+    def _room(self, n: int) -> None:
+        self._imu = ImuIncrements.empty(n)
+        self._gyro, self._residual = np.zeros((n, 4)), np.zeros(n)

@@ -201,13 +201,6 @@ def test_what_is_not_a_number_is_refused_by_its_number(field, value):
     assert np.abs(attitude_error(rows["q_nb"][-1], Q)).max() < 1e-10
 
 
-def test_the_pole_is_an_error_with_the_latitude():
-    navigator = Navigator(Settings())
-    navigator.begin(math.radians(89.99), 0.0, 0.0, np.zeros(3), Q, 0.0)
-    with pytest.raises(HilError, match=r"pole.*89\.99"):
-        navigator.process(rest(0.1))
-
-
 def test_bias_is_tracked_at_rest_and_not_in_motion():
     choice = Settings(lat=LAT, alignment="level", heading=math.radians(70), align_s=2.0, track_bias_at_rest=True)
     navigator = aligned(choice)
