@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nav.alignment import rest
-from nav.alignment.analytic import AlignmentRefused, earth_rate_in_body, gyrocompass, level
+from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.errors import HilError
+from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, Validity
 from nav.lever_arm import shift

@@ -11,8 +11,9 @@ import numpy as np
 
 from nav.earth import RATE
 from nav.errors import HilError
+from nav.frames import earth_rate_in_body
 from nav.increments import FloatArray
-from nav.rotation import multiply, quaternion_from_dcm, quaternion_from_euler
+from nav.rotation import quaternion_from_dcm, quaternion_from_euler
 
 SIGMAS = 3.0
 """The horizontal Earth rate must exceed this many standard deviations of the mean rate."""
@@ -113,13 +114,3 @@ def level(
     roll = math.atan2(-f_b[1], -f_b[2])
     q_nb = quaternion_from_euler(heading, pitch, roll)
     return Alignment(q_nb, w_ib_b - earth_rate_in_body(q_nb, lat), sigma_f / f, sigma_heading)
-
-
-def earth_rate_in_body(q_nb: FloatArray, lat: float) -> FloatArray:
-    """w_ie in body axes (3,), rad/s, at latitude `lat` (rad) for the attitude `q_nb` (4,)."""
-    w = np.array([0.0, RATE * math.cos(lat), 0.0, -RATE * math.sin(lat)])
-    conj = q_nb * np.array([1.0, -1.0, -1.0, -1.0])
-    out = np.empty(4)
-    multiply(conj, w, out)
-    multiply(out, q_nb, out)
-    return out[1:]

@@ -13,11 +13,11 @@ import math
 
 import numpy as np
 
-from nav.body_integrals import change_by_turn, cross, turn_of
 from nav.earth import RATE, curvature_radii
 from nav.gravitation import gravitation_local
 from nav.increments import FloatArray
 from nav.kernel import kernel
+from nav.turn import change_by_turn, cross, turn_of
 
 POLAR_CAP = 1e-3
 """cos(lat) below which the mechanization refuses to go on (6.4 km from the pole)."""

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from nav.alignment import rest
-from nav.alignment.analytic import AlignmentRefused, earth_rate_in_body, gyrocompass, level
+from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.earth import normal_gravity
+from nav.frames import earth_rate_in_body
 from nav.rotation import attitude_error, euler_from_quaternion
 
 EARTH_RATE = 7.292115e-5
