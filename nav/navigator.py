@@ -257,12 +257,10 @@ class Navigator:
             return
         lat = float(self._state[0])
         try:
-            if wrong:
-                raise AlignmentRefused(wrong)
             if self.settings.alignment == "level":
-                result = level(mean.f, mean.w, lat, self.heading or 0.0, mean.sigma_f)
+                result = level(mean, lat, self.heading or 0.0)
             else:
-                result = gyrocompass(mean.f, mean.w, lat, mean.sigma_f, mean.sigma_w)
+                result = gyrocompass(mean, lat)
         except AlignmentRefused as refusal:
             self._complain(time, Health.UNITS if wrong else Health.RATE_TOO_SMALL, str(refusal))
             self._sums[:] = 0.0
