@@ -27,7 +27,7 @@ from hil.world.motion import Motion
 from nav.increments import FloatArray, ImuIncrements
 from nav.mechanization import geographic
 from nav.navigator import Navigator, Settings
-from nav.rotation import euler_angles
+from nav.rotation import euler_from_quaternion
 from nav.strapdown import Strapdown
 
 REPEATS = 9
@@ -209,7 +209,7 @@ def _pyins_ns(record: StrapdownRecord) -> float | None:
     except ImportError:
         return None
     lat, lon, height, vel_n, q = record.start
-    angles = np.degrees(euler_angles(np.asarray(q)[None])[0])
+    angles = np.degrees(euler_from_quaternion(q))
     place = [np.degrees(lat), np.degrees(lon), height, *vel_n, angles[2], angles[1], angles[0]]
     start = pandas.Series(place, index=util.TRAJECTORY_COLS, name=0.0)
     index = pandas.Index(np.cumsum(record.step), name="time")

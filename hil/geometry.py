@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nav.earth import curvature_radii
 from nav.increments import FloatArray
-from nav.rotation import attitude_error, euler_angles
+from nav.rotation import attitude_error, euler_from_quaternion
 
 
 def position_error(lat: FloatArray, lon: FloatArray, height: FloatArray, reference: NDArray[np.void]) -> FloatArray:
@@ -28,7 +28,7 @@ def attitude_difference(q: FloatArray, q_reference: FloatArray) -> tuple[FloatAr
     """(total, tilt, heading) difference of attitudes (n, 4), rad; heading signed, in (-pi, pi]."""
     total = np.linalg.norm(attitude_error(q, q_reference), axis=-1)
     tilt = np.arccos(np.clip(np.sum(_down(q) * _down(q_reference), axis=-1), -1.0, 1.0))
-    turn = euler_angles(q)[:, 0] - euler_angles(q_reference)[:, 0]
+    turn = euler_from_quaternion(q)[:, 0] - euler_from_quaternion(q_reference)[:, 0]
     heading: FloatArray = np.remainder(turn + np.pi, 2 * np.pi) - np.pi
     return total, tilt, heading
 

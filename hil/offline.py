@@ -10,7 +10,7 @@ import numpy as np
 
 from nav.errors import HilError
 from nav.increments import FloatArray
-from nav.rotation import euler_angles, quaternion_from_euler
+from nav.rotation import euler_from_quaternion, quaternion_from_euler
 from nav.strapdown import Strapdown
 
 IMU_HEADER = ("time_s", "dtheta_x", "dtheta_y", "dtheta_z", "dvel_x", "dvel_y", "dvel_z")
@@ -168,7 +168,7 @@ def navigate(
     position, velocity, quaternion = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
     dtheta, dvel = np.ascontiguousarray(table[:, 1:4]), np.ascontiguousarray(table[:, 4:7])
     core.advance(step, dtheta, dvel, np.zeros(3), position, velocity, quaternion)
-    angles = np.degrees(euler_angles(quaternion))
+    angles = np.degrees(euler_from_quaternion(quaternion))
     place = np.column_stack([np.degrees(position[:, :2]), position[:, 2]])
     return np.column_stack([time, place, velocity, angles[:, ::-1]])
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from hil.reference import Reference
 from nav.errors import HilError
-from nav.rotation import euler_angles
+from nav.rotation import euler_from_quaternion
 
 
 def check_plot(path: Path) -> None:
@@ -43,7 +43,7 @@ def plot_difference(path: Path, reference: Reference, trace: Any, title: str) ->
     figure = Figure(figsize=(9, 7), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     for values, at, style in ((attitudes, times, "-"), (reference.q_nb, reference.time, ":")):
-        angles = np.degrees(euler_angles(np.ascontiguousarray(values)))
+        angles = np.degrees(euler_from_quaternion(values))
         angles[:, 0] = (angles[:, 0] + 180.0) % 360.0 - 180.0
         for i, (name, colour) in enumerate((("heading", "C0"), ("pitch", "C1"), ("roll", "C2"))):
             upper.plot(at - start, angles[:, i], style, color=colour, label=f"{name}{'' if style == '-' else ' (log)'}")

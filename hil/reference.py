@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from hil.geometry import Spread, attitude_difference
 from nav.increments import FloatArray
-from nav.rotation import from_rotation_vector, multiply, normalise
 from nav.state import Mode
+from nav.turn import multiply, normalise, quaternion_of
 
 SETTLE_S = 10.0
 """Time from the start of the log that is not compared."""
@@ -92,12 +92,11 @@ class Reference:
         first = int(np.searchsorted(self.gyro_time, self.time[0]))
         times = self.gyro_time[first:]
         attitudes = np.empty((len(times), 4))
-        q, delta = self.q_nb[0].copy(), np.empty(4)
+        q = self.q_nb[0].copy()
         for k in range(len(times)):
             if k:
                 turn = self.gyro[first + k] * (times[k] - times[k - 1])
-                from_rotation_vector(turn[0], turn[1], turn[2], delta)
-                multiply(q, delta, q)
+                multiply(q, np.array(quaternion_of(turn[0], turn[1], turn[2])), q)
                 normalise(q)
             attitudes[k] = q
         return times, attitudes

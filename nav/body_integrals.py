@@ -23,6 +23,7 @@ import numpy as np
 
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
+from nav.turn import change_by_turn, cross, turn_of
 
 MAX_WINDOW = 8
 """Most samples in a polynomial."""
@@ -37,46 +38,6 @@ MEMORY = _COEFFICIENT + 6 * MAX_WINDOW
 _ROOT15 = math.sqrt(15.0)
 _NODE = (0.5 - 0.1 * _ROOT15, 0.5, 0.5 + 0.1 * _ROOT15)
 _MASS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
-
-
-@inline_kernel
-def cross(ax: float, ay: float, az: float, bx: float, by: float, bz: float) -> tuple[float, float, float]:
-    """Cross product a x b."""
-    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-
-
-@inline_kernel
-def turn_of(x: float, y: float, z: float) -> tuple[float, float, float, float]:
-    """Unit quaternion of a rotation vector (rad) less the identity: scalar part minus one, vector part.
-
-    Without the one, small rotations lose nothing to rounding.
-    """
-    a2 = x * x + y * y + z * z
-    if a2 < 1e-3:
-        s = 0.5 - a2 * (1.0 / 48.0 - a2 * (1.0 / 3840.0 - a2 * (1.0 / 645120.0)))
-        w = -a2 * (0.125 - a2 * (1.0 / 384.0 - a2 * (1.0 / 46080.0)))
-    else:
-        a = math.sqrt(a2)
-        s = math.sin(0.5 * a) / a
-        w = math.sin(0.25 * a)
-        w = -2.0 * w * w
-    return w, s * x, s * y, s * z
-
-
-@inline_kernel
-def change_by_turn(x: float, y: float, z: float, vx: float, vy: float, vz: float) -> tuple[float, float, float]:
-    """What the rotation vector (x, y, z) changes of the vector v: exp([phi x]) v - v."""
-    a2 = x * x + y * y + z * z
-    if a2 < 1e-3:
-        s = 1.0 - a2 * (1.0 / 6.0 - a2 * (1.0 / 120.0 - a2 * (1.0 / 5040.0)))
-        c = 0.5 - a2 * (1.0 / 24.0 - a2 * (1.0 / 720.0 - a2 * (1.0 / 40320.0)))
-    else:
-        a = math.sqrt(a2)
-        s = math.sin(a) / a
-        c = (1.0 - math.cos(a)) / a2
-    tx, ty, tz = cross(x, y, z, vx, vy, vz)
-    ux, uy, uz = cross(x, y, z, tx, ty, tz)
-    return s * tx + c * ux, s * ty + c * uy, s * tz + c * uz
 
 
 @kernel

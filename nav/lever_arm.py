@@ -7,7 +7,7 @@ import numpy as np
 from nav.earth import curvature_radii
 from nav.increments import FloatArray
 from nav.kernel import kernel
-from nav.rotation import rotate
+from nav.turn import cross, rotate
 
 
 @kernel
@@ -26,9 +26,7 @@ def shift(
     """
     r, v = np.empty(3), np.empty(3)
     for k in range(lat.shape[0]):
-        v[0] = w_ib_b[k, 1] * arm_b[2] - w_ib_b[k, 2] * arm_b[1]
-        v[1] = w_ib_b[k, 2] * arm_b[0] - w_ib_b[k, 0] * arm_b[2]
-        v[2] = w_ib_b[k, 0] * arm_b[1] - w_ib_b[k, 1] * arm_b[0]
+        v[0], v[1], v[2] = cross(w_ib_b[k, 0], w_ib_b[k, 1], w_ib_b[k, 2], arm_b[0], arm_b[1], arm_b[2])
         rotate(q_nb[k], v, v)
         rotate(q_nb[k], arm_b, r)
         meridian, prime = curvature_radii(math.sin(lat[k]))

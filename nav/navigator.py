@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nav.alignment import rest
-from nav.alignment.analytic import AlignmentRefused, earth_rate_in_body, gyrocompass, level
+from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.errors import HilError
+from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, Validity
 from nav.lever_arm import shift
@@ -258,12 +259,10 @@ class Navigator:
             return
         lat = float(self._state[0])
         try:
-            if wrong:
-                raise AlignmentRefused(wrong)
             if self.settings.alignment == "level":
-                result = level(mean.f, mean.w, lat, self.heading or 0.0, mean.sigma_f)
+                result = level(mean, lat, self.heading or 0.0)
             else:
-                result = gyrocompass(mean.f, mean.w, lat, mean.sigma_f, mean.sigma_w)
+                result = gyrocompass(mean, lat)
         except AlignmentRefused as refusal:
             self._complain(time, Health.UNITS if wrong else Health.RATE_TOO_SMALL, str(refusal))
             self._sums[:] = 0.0

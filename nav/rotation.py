@@ -1,167 +1,216 @@
-"""Rotations: quaternions, direction cosines, rotation vectors, Euler angles, as kernels on small arrays.
+"""Rotations of whole arrays: quaternions (..., 4), direction cosines (..., 3, 3), rotation vectors and angles (..., 3).
 
-Conventions as in :mod:`nav`: ``q_ab`` is Hamilton, scalar first, and takes vectors from b to a. Kernels write into an
-`out` argument so that nothing is allocated per sample; `out` may not be one of the inputs unless it says so.
+Conventions as in :mod:`nav`: ``q_ab`` is Hamilton, scalar first, and takes vectors from b to a, as ``C_ab`` does; a
+rotation vector is axis times angle, rad; Euler angles are heading, pitch, roll, rad. Every function broadcasts over the
+leading axes, takes empty arrays, and returns new ones. What is done sample by sample is in :mod:`nav.turn`.
+
+Where a quaternion stands for a rotation it need not be of unit norm: it is normalised first. A matrix must be a rotation to
+`DEFECT`; :func:`orthonormal` mends a worse one. Every function raises `HilError` for a value that is not finite, a
+quaternion whose norm is not a positive number, a matrix that is not a rotation, and a wrong shape.
 """
 
-import math
-
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
+from nav.errors import HilError
 from nav.increments import FloatArray
-from nav.kernel import inline_kernel, kernel
+
+DEFECT = 1e-6
+"""Largest element of C C' - I that is taken for rounding."""
+LOCK = 1e-12
+"""Gimbal lock: half of the distance of pitch from +-90 deg, rad, below which heading takes the whole turn."""
 
 
-@inline_kernel
-def multiply(p: FloatArray, q: FloatArray, out: FloatArray) -> None:
-    """Quaternion product p q; `out` may be `p` or `q`."""
-    w = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
-    x = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
-    y = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
-    z = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]
-    out[0], out[1], out[2], out[3] = w, x, y, z
-
-
-@inline_kernel
-def normalise(q: FloatArray) -> None:
-    """Scale `q` to unit norm in place."""
-    s = 1.0 / math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    for i in range(4):
-        q[i] *= s
-
-
-@inline_kernel
-def half_sinc(angle2: float) -> float:
-    """sin(a/2)/a for a = sqrt(angle2), by its series where that is exact to the last digit."""
-    if angle2 < 1e-3:
-        return 0.5 - angle2 * (1.0 / 48.0 - angle2 * (1.0 / 3840.0 - angle2 * (1.0 / 645120.0)))
-    angle = math.sqrt(angle2)
-    return math.sin(0.5 * angle) / angle
-
-
-@inline_kernel
-def from_rotation_vector(x: float, y: float, z: float, out: FloatArray) -> None:
-    """Quaternion of the rotation vector (x, y, z), rad."""
-    angle2 = x * x + y * y + z * z
-    s = half_sinc(angle2)
-    out[0] = 1.0 - 0.5 * angle2 * (0.25 - angle2 / 192.0 + angle2 * angle2 / 23040.0)
-    if angle2 >= 1e-3:
-        out[0] = math.cos(0.5 * math.sqrt(angle2))
-    out[1], out[2], out[3] = s * x, s * y, s * z
-
-
-@inline_kernel
-def rotate(q: FloatArray, v: FloatArray, out: FloatArray) -> None:
-    """C(q) v: with ``q_ab`` the vector in a of `v` given in b; `out` may be `v`."""
-    tx = 2.0 * (q[2] * v[2] - q[3] * v[1])
-    ty = 2.0 * (q[3] * v[0] - q[1] * v[2])
-    tz = 2.0 * (q[1] * v[1] - q[2] * v[0])
-    x = v[0] + q[0] * tx + q[2] * tz - q[3] * ty
-    y = v[1] + q[0] * ty + q[3] * tx - q[1] * tz
-    z = v[2] + q[0] * tz + q[1] * ty - q[2] * tx
-    out[0], out[1], out[2] = x, y, z
-
-
-@kernel
-def dcm_from_quaternion(q: FloatArray) -> FloatArray:
-    """Direction-cosine matrix C_ab (3, 3) of the unit quaternion q_ab."""
-    c = np.empty((3, 3))
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    c[0, 0] = w * w + x * x - y * y - z * z
-    c[1, 1] = w * w - x * x + y * y - z * z
-    c[2, 2] = w * w - x * x - y * y + z * z
-    c[0, 1] = 2.0 * (x * y - w * z)
-    c[1, 0] = 2.0 * (x * y + w * z)
-    c[0, 2] = 2.0 * (x * z + w * y)
-    c[2, 0] = 2.0 * (x * z - w * y)
-    c[1, 2] = 2.0 * (y * z - w * x)
-    c[2, 1] = 2.0 * (y * z + w * x)
-    return c
-
-
-@kernel
-def quaternion_from_dcm(c: FloatArray) -> FloatArray:
-    """Unit quaternion q_ab of the direction-cosine matrix C_ab, scalar part not negative (Shepperd's method)."""
-    trace = c[0, 0] + c[1, 1] + c[2, 2]
-    best, i = trace, 3
-    for k in range(3):
-        if c[k, k] > best:
-            best, i = c[k, k], k
-    q = np.empty(4)
-    if i == 3:
-        q[0] = 1.0 + trace
-        q[1] = c[2, 1] - c[1, 2]
-        q[2] = c[0, 2] - c[2, 0]
-        q[3] = c[1, 0] - c[0, 1]
-    else:
-        j, k = (i + 1) % 3, (i + 2) % 3
-        q[0] = c[k, j] - c[j, k]
-        q[1 + i] = 1.0 + 2.0 * c[i, i] - trace
-        q[1 + j] = c[j, i] + c[i, j]
-        q[1 + k] = c[k, i] + c[i, k]
-    if q[0] < 0.0:
-        q = -q
-    normalise(q)
-    return q
-
-
-@kernel
-def quaternion_from_euler(heading: float, pitch: float, roll: float) -> FloatArray:
-    """q_nb of yaw-pitch-roll angles, rad."""
-    ch, sh = math.cos(0.5 * heading), math.sin(0.5 * heading)
-    cp, sp = math.cos(0.5 * pitch), math.sin(0.5 * pitch)
-    cr, sr = math.cos(0.5 * roll), math.sin(0.5 * roll)
-    q = np.empty(4)
-    q[0] = ch * cp * cr + sh * sp * sr
-    q[1] = ch * cp * sr - sh * sp * cr
-    q[2] = ch * sp * cr + sh * cp * sr
-    q[3] = sh * cp * cr - ch * sp * sr
-    return q
-
-
-@kernel
-def euler_from_quaternion(q: FloatArray) -> tuple[float, float, float]:
-    """(heading, pitch, roll) of q_nb, rad; heading in [0, 2 pi). At pitch +-90 deg heading takes the whole turn."""
-    s = 2.0 * (q[0] * q[2] - q[3] * q[1])
-    roll = math.atan2(2.0 * (q[0] * q[1] + q[2] * q[3]), 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))
-    heading = math.atan2(2.0 * (q[0] * q[3] + q[1] * q[2]), 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3]))
-    if abs(s) > 1.0 - 1e-12:  # gimbal lock: only heading -+ roll is defined
-        roll = 0.0
-        heading = -2.0 * math.copysign(1.0, s) * math.atan2(q[1], q[0])
-    pitch = math.asin(min(1.0, max(-1.0, s)))
-    heading %= 2.0 * math.pi
-    if heading >= 2.0 * math.pi:  # the remainder of a tiny negative angle rounds up to the whole turn
-        heading = 0.0
-    return heading, pitch, roll
-
-
-@kernel
-def euler_angles(q: FloatArray) -> FloatArray:
-    """(n, 3) heading, pitch, roll of the quaternions q_nb (n, 4), rad."""
-    out = np.empty((q.shape[0], 3))
-    for k in range(q.shape[0]):
-        out[k, 0], out[k, 1], out[k, 2] = euler_from_quaternion(q[k])
-    return out
-
-
-def attitude_error(q: FloatArray, q_true: FloatArray) -> FloatArray:
-    """Rotation vector (..., 3) in n that takes the true attitude to `q`, rad, by the short way.
-
-    Parameters
-    ----------
-    q, q_true : (..., 4) float
-        Attitudes q_nb.
-    """
-    w, x, y, z = (q_true[..., i] for i in range(4))
-    a, b, c, d = (q[..., i] for i in range(4))
-    # q * conj(q_true)
-    scalar = a * w + b * x + c * y + d * z
-    vector = np.stack(
-        [-a * x + b * w - c * z + d * y, -a * y + b * z + c * w - d * x, -a * z - b * y + c * x + d * w], axis=-1
+def product(p: ArrayLike, q: ArrayLike) -> FloatArray:
+    """Hamilton's product p q; ``q_ac = q_ab q_bc``. Norms multiply."""
+    p, q = _array(p, "quaternion", 4), _array(q, "quaternion", 4)
+    (a, b, c, d), (w, x, y, z) = np.moveaxis(p, -1, 0), np.moveaxis(q, -1, 0)
+    return np.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=-1,
     )
-    norm = np.linalg.norm(vector, axis=-1)
-    angle = 2.0 * np.arctan2(norm, np.abs(scalar))
-    scale = np.where(norm > 0.0, angle / np.where(norm > 0.0, norm, 1.0), 2.0) * np.where(scalar < 0.0, -1.0, 1.0)
-    error: NDArray[np.float64] = vector * scale[..., None]
-    return error
+
+
+def conjugate(q: ArrayLike) -> FloatArray:
+    """The same rotation the other way: ``q_ba`` of ``q_ab``."""
+    q = _array(q, "quaternion", 4)
+    return np.concatenate([q[..., :1], -q[..., 1:]], axis=-1)
+
+
+def normalised(q: ArrayLike) -> FloatArray:
+    """`q` of unit norm."""
+    q = _array(q, "quaternion", 4)
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not ((norm > 0.0) & (norm < np.inf)).all():
+        raise HilError("a quaternion of norm 0 (or beyond the numbers) is no rotation: is there an attitude yet?")
+    unit: FloatArray = q / norm
+    return unit
+
+
+def orthonormal(c: ArrayLike) -> FloatArray:
+    """The rotation matrix that is nearest to `c` (least squares of the elements)."""
+    c = _array(c, "matrix", 3, 3)
+    if not (np.linalg.det(c) > 0.0).all():
+        raise HilError("a matrix that is singular or turns right hands into left ones has no rotation near it")
+    left, _, right = np.linalg.svd(c)
+    nearest: FloatArray = left @ right
+    return nearest
+
+
+def rotated(q: ArrayLike, v: ArrayLike) -> FloatArray:
+    """C(q) v: with ``q_ab`` the vectors in a of those given in b, (..., 3)."""
+    v = _array(v, "vector", 3)
+    q = normalised(q)
+    twice = 2.0 * np.cross(q[..., 1:], v)
+    turned: FloatArray = v + q[..., :1] * twice + np.cross(q[..., 1:], twice)
+    return turned
+
+
+def relative(q_na: ArrayLike, q_nb: ArrayLike) -> FloatArray:
+    """q_ab of two attitudes in the same frame: conj(q_na) q_nb."""
+    return product(conjugate(q_na), q_nb)
+
+
+def attitude_error(q: ArrayLike, q_true: ArrayLike) -> FloatArray:
+    """Rotation vector (..., 3) in n that takes the true attitude to `q` (both q_nb), rad, by the short way."""
+    return rotation_vector_from_quaternion(product(q, conjugate(q_true)))
+
+
+def slerp(q_a: ArrayLike, q_b: ArrayLike, part: ArrayLike) -> FloatArray:
+    """The attitude at `part` (...) of the short way from `q_a` (0) to `q_b` (1), at a constant rate."""
+    way = rotation_vector_from_quaternion(relative(q_a, q_b))
+    return product(normalised(q_a), quaternion_from_rotation_vector(np.asarray(part, float)[..., None] * way))
+
+
+def quaternion_from_rotation_vector(phi: ArrayLike) -> FloatArray:
+    """Unit quaternion of a rotation vector of any length."""
+    phi = _array(phi, "rotation vector", 3)
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
+    there = angle > 0.0
+    half_sinc = np.where(there, np.sin(0.5 * angle) / np.where(there, angle, 1.0), 0.5)
+    return np.concatenate([np.cos(0.5 * angle), half_sinc * phi], axis=-1)
+
+
+def rotation_vector_from_quaternion(q: ArrayLike) -> FloatArray:
+    """Rotation vector of length pi at most. Of the two at a half turn, that along the vector part."""
+    q = normalised(q)
+    norm = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    there = norm > 0.0
+    scale = np.where(there, 2.0 * np.arctan2(norm, np.abs(q[..., :1])) / np.where(there, norm, 1.0), 2.0)
+    phi: FloatArray = np.where(q[..., :1] < 0.0, -scale, scale) * q[..., 1:]
+    return phi
+
+
+def dcm_from_quaternion(q: ArrayLike) -> FloatArray:
+    """C_ab of q_ab."""
+    w, x, y, z = np.moveaxis(normalised(q), -1, 0)
+    rows = [
+        [w * w + x * x - y * y - z * z, 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), w * w - x * x - y * y + z * z],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_dcm(c: ArrayLike) -> FloatArray:
+    """Unit quaternion q_ab of C_ab, scalar part not negative: the longest row of 4 q q' (Shepperd's method)."""
+    c = _array(c, "matrix", 3, 3)
+    defect = np.abs(c @ np.swapaxes(c, -1, -2) - np.eye(3))
+    if not ((defect.max(axis=(-1, -2)) < DEFECT) & (np.linalg.det(c) > 0.0)).all():
+        raise HilError(
+            f"a matrix is not a rotation: C C' leaves I by {defect.max():.2g}, or its determinant is negative"
+        )
+    xx, yy, zz = c[..., 0, 0], c[..., 1, 1], c[..., 2, 2]
+    wx, wy, wz = c[..., 2, 1] - c[..., 1, 2], c[..., 0, 2] - c[..., 2, 0], c[..., 1, 0] - c[..., 0, 1]
+    xy, xz, yz = c[..., 1, 0] + c[..., 0, 1], c[..., 0, 2] + c[..., 2, 0], c[..., 2, 1] + c[..., 1, 2]
+    rows = [
+        [1.0 + xx + yy + zz, wx, wy, wz],
+        [wx, 1.0 + xx - yy - zz, xy, xz],
+        [wy, xy, 1.0 - xx + yy - zz, yz],
+        [wz, xz, yz, 1.0 - xx - yy + zz],
+    ]
+    outer = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    longest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = normalised(np.take_along_axis(outer, longest[..., None, None], axis=-2)[..., 0, :])
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def quaternion_from_euler(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
+    """q_nb of yaw-pitch-roll angles (...), rad, of any size."""
+    angles = np.stack(np.broadcast_arrays(heading, pitch, roll), axis=-1)
+    half = 0.5 * _array(angles, "Euler angles", 3)
+    (ch, cp, cr), (sh, sp, sr) = np.moveaxis(np.cos(half), -1, 0), np.moveaxis(np.sin(half), -1, 0)
+    return np.stack(
+        [
+            ch * cp * cr + sh * sp * sr,
+            ch * cp * sr - sh * sp * cr,
+            ch * sp * cr + sh * cp * sr,
+            sh * cp * cr - ch * sp * sr,
+        ],
+        axis=-1,
+    )
+
+
+def euler_from_quaternion(q: ArrayLike) -> FloatArray:
+    """(..., 3) heading [0, 2 pi), pitch, roll (-pi, pi] of q_nb, rad.
+
+    The half sum and the half difference of heading and roll are angles of the quaternion's parts, and the lengths of these
+    parts are the sine and cosine of half the distance of pitch from -90 deg: nothing loses digits near the vertical. At
+    `LOCK` heading takes the whole turn and roll is 0.
+    """
+    w, x, y, z = np.moveaxis(normalised(q), -1, 0)
+    plus, minus = np.arctan2(x + z, w - y), np.arctan2(z - x, w + y)
+    below, above = np.hypot(w + y, z - x), np.hypot(w - y, x + z)
+    pitch = np.arctan2(2.0 * (w * y - x * z), below * above)
+    locked_up, locked_down = above < LOCK, below < LOCK
+    heading = np.where(locked_up, 2.0 * minus, np.where(locked_down, 2.0 * plus, plus + minus))
+    roll = np.where(locked_up | locked_down, 0.0, plus - minus)
+    roll -= 2.0 * np.pi * np.ceil(roll / (2.0 * np.pi) - 0.5)
+    heading = np.remainder(heading, 2.0 * np.pi)
+    heading = np.where(heading < 2.0 * np.pi, heading, 0.0)  # the remainder of a tiny negative angle rounds up
+    return np.stack([heading, pitch, roll], axis=-1)
+
+
+def dcm_from_rotation_vector(phi: ArrayLike) -> FloatArray:
+    """C of a rotation vector."""
+    return dcm_from_quaternion(quaternion_from_rotation_vector(phi))
+
+
+def rotation_vector_from_dcm(c: ArrayLike) -> FloatArray:
+    """Rotation vector of C, of length pi at most."""
+    return rotation_vector_from_quaternion(quaternion_from_dcm(c))
+
+
+def dcm_from_euler(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
+    """C_nb of yaw-pitch-roll angles."""
+    return dcm_from_quaternion(quaternion_from_euler(heading, pitch, roll))
+
+
+def euler_from_dcm(c: ArrayLike) -> FloatArray:
+    """Heading, pitch, roll of C_nb, ranges as of `euler_from_quaternion`."""
+    return euler_from_quaternion(quaternion_from_dcm(c))
+
+
+def rotation_vector_from_euler(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> FloatArray:
+    """Rotation vector of yaw-pitch-roll angles, of length pi at most."""
+    return rotation_vector_from_quaternion(quaternion_from_euler(heading, pitch, roll))
+
+
+def euler_from_rotation_vector(phi: ArrayLike) -> FloatArray:
+    """Heading, pitch, roll of a rotation vector, ranges as of `euler_from_quaternion`."""
+    return euler_from_quaternion(quaternion_from_rotation_vector(phi))
+
+
+def _array(values: ArrayLike, what: str, *tail: int) -> FloatArray:
+    array = np.asarray(values, float)
+    if array.shape[-len(tail) :] != tail:
+        raise HilError(f"{what}: shape {array.shape} where (..., {', '.join(map(str, tail))}) is needed")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise HilError(f"{what}: element {where} is {array[where]}: mend what computed it")
+    return array

@@ -19,6 +19,7 @@ from nav.errors import HilError
 from nav.gravitation import field_code
 from nav.increments import FloatArray
 from nav.mechanization import cartesian, geographic, wander
+from nav.turn import turns_between
 
 MECHANIZATIONS = kernels.MECHANIZATIONS
 ATTITUDES = (
@@ -288,7 +289,7 @@ class Strapdown:
         rows = np.empty((n, 4))
         stream.push(step, np.ascontiguousarray(dtheta), rows)
         before = np.concatenate([self._q[None], rows[:-1]])
-        self._dq[:n] = _turns(before, rows)
+        turns_between(before, rows, self._dq[:n])
         self._q = rows[-1].copy()
 
 
@@ -298,20 +299,6 @@ def _entry() -> Any:
     if not kernel.signatures:
         kernel(np.zeros(kernels.CORE).ctypes.data, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return next(iter(kernel.overloads.values())).entry_point
-
-
-def _turns(before: FloatArray, after: FloatArray) -> FloatArray:
-    """conj(before) after, less the identity: scalar part from the vector part, so that nothing is lost to rounding."""
-    a, b, c, d = before.T
-    e, f, g, h = after.T
-    vector = np.stack(
-        [a * f - b * e - c * h + d * g, a * g + b * h - c * e - d * f, a * h - b * g + c * f - d * e], axis=1
-    )
-    scalar = a * e + b * f + c * g + d * h
-    vector *= np.sign(scalar)[:, None]
-    s2 = np.einsum("ij,ij->i", vector, vector)
-    less = -s2 / (1.0 + np.sqrt(np.maximum(0.0, 1.0 - s2)))
-    return np.column_stack([less, vector])
 
 
 def _method(attitude: str) -> attitudes.AttitudeMethod:

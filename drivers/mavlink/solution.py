@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import numpy as np
-
 from nav.earth import E2, RATE, A
 from nav.rotation import euler_from_quaternion
 from nav.state import Health, Mode
@@ -88,7 +86,7 @@ class Solution:
     @cached_property
     def euler(self) -> Vector:
         """Heading [0, 2 pi), pitch, roll, rad."""
-        heading, pitch, roll = euler_from_quaternion(np.array(self.q_nb))
+        heading, pitch, roll = euler_from_quaternion(self.q_nb).tolist()
         return heading, pitch, roll
 
     @cached_property

@@ -80,6 +80,27 @@ def accumulate(
 
 
 @dataclass(frozen=True, slots=True)
+class Sensors:
+    """What is known of the sensors, one sigma an axis; 0: not stated.
+
+    Attributes
+    ----------
+    angle_random_walk, velocity_random_walk : float
+        White noise of rate and specific force, rad/sqrt(s) and m/s/sqrt(s). Not stated, it is the scatter of the blocks.
+    gyro_bias, accelerometer_bias : float
+        rad/s and m/s^2.
+    """
+
+    angle_random_walk: float = 0.0
+    velocity_random_walk: float = 0.0
+    gyro_bias: float = 0.0
+    accelerometer_bias: float = 0.0
+
+
+UNSTATED = Sensors()
+
+
+@dataclass(frozen=True, slots=True)
 class Means:
     """Averages over all complete blocks.
 
@@ -90,7 +111,9 @@ class Means:
     w, f : (3,) float
         Mean rate, rad/s, and specific force, m/s^2.
     sigma_w, sigma_f : float
-        Standard deviation of the means (worst axis) from the scatter of the blocks.
+        Standard deviation of the means (worst axis) from the scatter of the blocks; 0 of a single one.
+    blocks : int
+        How many.
     """
 
     time_s: float
@@ -98,6 +121,7 @@ class Means:
     f: FloatArray
     sigma_w: float
     sigma_f: float
+    blocks: int
 
 
 def means(sums: FloatArray) -> Means:
@@ -106,7 +130,12 @@ def means(sums: FloatArray) -> Means:
     mean = sums[_TOTAL + 1 : _TOTAL + 7] / time
     variance = np.maximum(sums[_SQUARES : _SQUARES + 6] / count - mean**2, 0.0) / max(count - 1.0, 1.0)
     sigma = np.sqrt(variance)
-    return Means(float(time), mean[:3], mean[3:], float(sigma[:3].max()), float(sigma[3:].max()))
+    return Means(float(time), mean[:3], mean[3:], float(sigma[:3].max()), float(sigma[3:].max()), int(count))
+
+
+def blocks(sums: FloatArray) -> int:
+    """Complete blocks in `sums`."""
+    return int(sums[_COUNT])
 
 
 def progress(sums: FloatArray, goal_s: float) -> float:

@@ -13,14 +13,14 @@ import math
 import numpy as np
 
 from nav.attitude.coning import coning_stream_turn, coning_turn, coning_uncompressed_turn
-from nav.attitude.euler_vector import euler_vector_step, vector_from_quaternion
+from nav.attitude.euler_vector import euler_vector_step
 from nav.attitude.four_sample import four_sample_turn
 from nav.attitude.high_order import MAX_SAMPLES, WORK, fit_rate, node, rate_at, turns
 from nav.attitude.picard import picard3_turn
-from nav.attitude.poisson import matrix_from_quaternion, poisson_step, quaternion_from_matrix
-from nav.attitude.quaternion import Quaternion, quaternion_of
+from nav.attitude.poisson import poisson_step
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
+from nav.turn import Quaternion, matrix_from_quaternion, quaternion_from_matrix, quaternion_of, vector_from_quaternion
 
 HIGH_ORDER, PICARD3, PICARD3_SOURCE, FOUR_SAMPLE, FOUR_SAMPLE_SERIES = 0, 1, 2, 3, 4
 CONING, CONING_UNCOMPRESSED, CONING_STREAM, POISSON, EULER_VECTOR = 5, 6, 7, 8, 9

@@ -11,9 +11,9 @@ The coefficients hold for equal steps. With two samples the exact coefficient fo
 import numpy as np
 
 from nav.attitude.picard import previous_increment_coefficient
-from nav.attitude.quaternion import Quaternion, quaternion_of
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel
+from nav.turn import Quaternion, quaternion_of
 
 MAX_SAMPLES = 5
 

@@ -61,14 +61,3 @@ def euler_vector_step(phi: FloatArray, rates: FloatArray, step: float) -> None:
     angle = math.sqrt(x * x + y * y + z * z)
     fold = 1.0 - 2.0 * math.pi / angle if angle > math.pi else 1.0
     phi[0], phi[1], phi[2] = fold * x, fold * y, fold * z
-
-
-@inline_kernel
-def vector_from_quaternion(q: FloatArray, phi: FloatArray) -> None:
-    """Rotation vector of the unit quaternion `q`, rad, of length pi at most."""
-    n = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    w = abs(q[0])
-    s = 2.0 * math.atan2(n, w) / n if n > 0.0 else 2.0
-    if q[0] < 0.0:
-        s = -s
-    phi[0], phi[1], phi[2] = s * q[1], s * q[2], s * q[3]

@@ -4,9 +4,9 @@ Source: Fomichev 2011, sec. 1. The quaternion of the rotation vector is exact or
 error accumulates in fast turns.
 """
 
-from nav.attitude.quaternion import Quaternion, quaternion_of
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel
+from nav.turn import Quaternion, quaternion_of
 
 
 @inline_kernel

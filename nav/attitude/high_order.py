@@ -14,9 +14,9 @@ import math
 
 import numpy as np
 
-from nav.attitude.quaternion import Quaternion
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel
+from nav.turn import Quaternion
 
 MAX_SAMPLES = 10
 """Most samples in a polynomial: beyond it, equally spaced samples amplify their noise more than they add order."""

@@ -5,9 +5,9 @@ Source: Uspensky & Bagmut 2009, eqs. 13 and 14. Global error of the third order 
 
 import math
 
-from nav.attitude.quaternion import Quaternion
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel
+from nav.turn import Quaternion
 
 
 @inline_kernel

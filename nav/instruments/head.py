@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from nav.increments import FloatArray, HeadIncrements, ImuIncrements, Validity
+from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray, Validity
 from nav.instruments import redundancy
 from nav.instruments.dtg import Rotor
 from nav.instruments.dtg_compensation import LagCompensator
@@ -66,7 +66,7 @@ class Note:
 
 @kernel
 def _combine(
-    gyro: FloatArray, dvel: FloatArray, inverse: FloatArray, flag: int, dtheta: FloatArray, validity: FloatArray
+    gyro: FloatArray, dvel: FloatArray, inverse: FloatArray, flag: int, dtheta: FloatArray, validity: IntArray
 ) -> None:
     for k in range(gyro.shape[0]):
         a, b, c, d = gyro[k, 0], gyro[k, 1], gyro[k, 2], gyro[k, 3]
@@ -221,7 +221,7 @@ class HeadCombiner:
         self._parity = np.zeros(4) if lost.any() else redundancy.parity_vector(self._h)
         self._doubt, self._spans = doubt, inverse is not None
 
-    def _tell(self, time: float, before: np.ndarray) -> None:
+    def _tell(self, time: float, before: IntArray) -> None:
         self._weigh()
         parity = [AXES[k] for k in range(4) if self.faults[k] & ~before[k] & Fault.PARITY.value]
         for k in np.flatnonzero(self.faults != before):
@@ -234,7 +234,11 @@ class HeadCombiner:
                 self._notes.append(Note(time, True, f"axis {name}: {what}; {self._consequence(int(k))}"))
         if parity and self._doubt:
             self._notes.append(
-                Note(time, True, f"{' and '.join(parity)} disagree, and nothing tells which is wrong: attitude is not to be trusted")
+                Note(
+                    time,
+                    True,
+                    f"{' and '.join(parity)} disagree, and nothing tells which is wrong: attitude is not to be trusted",
+                )
             )
 
     def _consequence(self, axis: int) -> str:

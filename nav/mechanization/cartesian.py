@@ -12,11 +12,13 @@ import math
 
 import numpy as np
 
-from nav.body_integrals import cross, turn_of
 from nav.earth import E2, RATE, A, curvature_radii
+from nav.frames import level_in_earth
 from nav.gravitation import gravitation_cartesian, near_latitude
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
+from nav.rotation import product, rotated
+from nav.turn import cross, turn_of
 
 STATE = 29
 """r (3) | v (3) | q (4) | rounding left of r (3) and q (4) | gravitation at the last mid-step (3), its step | sine, cosine
@@ -35,36 +37,13 @@ def start(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatA
     _, prime = curvature_radii(sin_lat)
     p = (prime + height) * cos_lat
     state[0:3] = p * cos_lon, p * sin_lon, (prime * (1.0 - E2) + height) * sin_lat
-    c_en = _level_axes(sin_lat, cos_lat, sin_lon, cos_lon)
-    state[3:6] = c_en @ np.asarray(vel_n, float)
+    q_en = level_in_earth(lat, lon)
+    state[3:6] = rotated(q_en, vel_n)
     if turn_rate == 0.0:
         state[3:6] += RATE * np.array([-state[1], state[0], 0.0])
-    state[6:10] = _multiply(_level_quaternion(lat, lon), np.asarray(q_nb, float))
+    state[6:10] = product(q_en, q_nb)
     state[_LAT], state[_LAT + 1] = sin_lat, cos_lat
     return state
-
-
-def _level_axes(sin_lat: float, cos_lat: float, sin_lon: float, cos_lon: float) -> FloatArray:
-    return np.array(
-        [
-            [-sin_lat * cos_lon, -sin_lon, -cos_lat * cos_lon],
-            [-sin_lat * sin_lon, cos_lon, -cos_lat * sin_lon],
-            [cos_lat, 0.0, -sin_lat],
-        ]
-    )
-
-
-def _level_quaternion(lat: float, lon: float) -> FloatArray:
-    """q_en: turn by the longitude about z, then by -(lat + 90 deg) about the new y."""
-    a, b = 0.5 * lon, -0.5 * (lat + 0.5 * math.pi)
-    return np.array(
-        [math.cos(a) * math.cos(b), -math.sin(a) * math.sin(b), math.cos(a) * math.sin(b), math.sin(a) * math.cos(b)]
-    )
-
-
-def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
-    vector = p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:])
-    return np.array([p[0] * q[0] - p[1:] @ q[1:], *vector])
 
 
 @inline_kernel

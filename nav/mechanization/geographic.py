@@ -13,11 +13,11 @@ import math
 
 import numpy as np
 
-from nav.body_integrals import change_by_turn, cross, turn_of
 from nav.earth import RATE, curvature_radii
 from nav.gravitation import gravitation_local
 from nav.increments import FloatArray
 from nav.kernel import kernel
+from nav.turn import change_by_turn, cross, turn_of
 
 MAX_LAT = math.acos(1e-3)
 """Latitude beyond which no step starts, rad (6.4 km from the pole)."""

@@ -14,12 +14,13 @@ import math
 
 import numpy as np
 
-from nav.body_integrals import change_by_turn, cross, turn_of
 from nav.earth import E2, RATE, A
+from nav.frames import level_in_earth
 from nav.gravitation import gravitation_local
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
-from nav.mechanization.cartesian import _level_quaternion, _multiply
+from nav.rotation import product
+from nav.turn import change_by_turn, cross, turn_of
 
 STATE = 20
 """q_ew (4) | height | vel_w (3) | q_wb (4) | what rounding left of q_ew (4), q_wb (4)."""
@@ -32,11 +33,11 @@ def start(
     q_nw = np.array([0.0, math.cos(0.25 * math.pi + 0.5 * azimuth), math.sin(0.25 * math.pi + 0.5 * azimuth), 0.0])
     q_wn = q_nw * np.array([1.0, -1.0, -1.0, -1.0])
     state = np.zeros(STATE)
-    state[0:4] = _multiply(_level_quaternion(lat, lon), q_nw)
+    state[0:4] = product(level_in_earth(lat, lon), q_nw)
     state[4] = height
     s, c = math.sin(azimuth), math.cos(azimuth)
     state[5:8] = c * vel_n[1] - s * vel_n[0], s * vel_n[1] + c * vel_n[0], -vel_n[2]
-    state[8:12] = _multiply(q_wn, np.asarray(q_nb, float))
+    state[8:12] = product(q_wn, q_nb)
     return state
 
 
@@ -46,7 +47,7 @@ def correct_azimuth(state: FloatArray, change: float) -> None:
     The gyroscopic heading psi_r and the velocity in w are taken as exact; in n both turn with A.
     """
     q_turn = np.array([math.cos(0.5 * change), 0.0, 0.0, -math.sin(0.5 * change)])
-    state[0:4] = _multiply(state[0:4], q_turn)
+    state[0:4] = product(state[0:4], q_turn)
     state[12:16] = 0.0
 
 

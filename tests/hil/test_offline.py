@@ -9,7 +9,7 @@ from hil.offline import IMU_HEADER, NAV_HEADER, navigate, read_start, read_table
 from hil.scenario import load
 from hil.world.motion import Motion
 from nav.errors import HilError
-from nav.rotation import euler_angles
+from nav.rotation import euler_from_quaternion
 
 START = 70.0
 ROWS = np.column_stack([0.01 * np.arange(1, 6), np.random.default_rng(1).normal(size=(5, 6)) * 1e-3])
@@ -17,7 +17,7 @@ ROWS = np.column_stack([0.01 * np.arange(1, 6), np.random.default_rng(1).normal(
 
 def start_of(motion, time):
     (row,) = motion.truth([time])
-    heading, pitch, roll = np.degrees(euler_angles(row["q_nb"][None])[0])
+    heading, pitch, roll = np.degrees(euler_from_quaternion(row["q_nb"][None])[0])
     place = (math.degrees(row["lat"]), math.degrees(row["lon"]), row["height"])
     return dict(zip(NAV_HEADER, (time, *place, *row["vel_n"], roll, pitch, heading), strict=True))
 
@@ -64,7 +64,7 @@ def test_the_flight_is_navigated(flight, tmp_path, attitude, mechanization):
     assert np.abs(rows[:, 2] - np.degrees(truth["lon"])).max() * 71e3 < 0.01
     assert np.abs(rows[:, 3] - truth["height"]).max() < 0.01
     assert np.abs(rows[:, 4:7] - truth["vel_n"]).max() < 1e-3
-    angles = np.degrees(euler_angles(truth["q_nb"]))[:, ::-1]
+    angles = np.degrees(euler_from_quaternion(truth["q_nb"]))[:, ::-1]
     assert np.abs((rows[:, 7:] - angles + 180) % 360 - 180).max() < 1e-7
 
 

@@ -4,13 +4,15 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from nav.alignment import rest
-from nav.alignment.analytic import AlignmentRefused, earth_rate_in_body, gyrocompass, level
+from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
+from nav.alignment.rest import UNSTATED, Sensors
 from nav.earth import normal_gravity
+from nav.frames import earth_rate_in_body
 from nav.rotation import attitude_error, euler_from_quaternion
 
 EARTH_RATE = 7.292115e-5
@@ -26,6 +28,10 @@ def at_rest(attitude, lat):
     return f, w
 
 
+def averaged(f, w, sigma_f=0.0, sigma_w=0.0):
+    return rest.Means(60.0, w, f, sigma_w, sigma_f, 120)
+
+
 def error(result, attitude):
     return attitude_error(result.q_nb, attitude.as_quat(scalar_first=True))
 
@@ -34,10 +40,10 @@ def error(result, attitude):
 def test_exact_on_the_rotating_earth(heading, pitch, roll, lat):
     attitude = Rotation.from_euler("ZYX", [heading, pitch, roll], degrees=True)
     f, w = at_rest(attitude, lat)
-    found = gyrocompass(f, w, lat)
+    found = gyrocompass(averaged(f, w), lat)
     assert np.linalg.norm(error(found, attitude)) < 1e-14 / math.cos(lat)
-    given_heading = level(f, w, lat, math.radians(heading))
-    assert np.linalg.norm(error(given_heading, attitude)) < 2e-13  # asin of a pitch near 90 deg
+    given_heading = level(averaged(f, w), lat, math.radians(heading))
+    assert np.linalg.norm(error(given_heading, attitude)) < 1e-14
     np.testing.assert_allclose(given_heading.gyro_bias, 0.0, atol=1e-16)
     np.testing.assert_allclose(earth_rate_in_body(attitude.as_quat(scalar_first=True), lat), w, atol=1e-19)
 
@@ -49,42 +55,31 @@ def test_classical_limits(heading, lat, sign):
     f, w = at_rest(attitude, lat)
     g = float(np.linalg.norm(f))
     bias = sign * 1e-3
-    tilt = error(gyrocompass(f + attitude.inv().apply([bias, 0, 0]), w, lat), attitude)  # north accelerometer: pitch
+    tilt = error(
+        gyrocompass(averaged(f + attitude.inv().apply([bias, 0, 0]), w), lat), attitude
+    )  # north accelerometer: pitch
     assert tilt[1] == pytest.approx(bias / g, rel=1e-6)
     assert abs(tilt[0]) < 1e-9
     assert tilt[2] == pytest.approx(0.0, abs=2e-7 * max(1.0, math.tan(abs(lat)) ** 2))
-    turn = error(gyrocompass(f + attitude.inv().apply([0, bias, 0]), w, lat), attitude)  # east accelerometer: roll
+    turn = error(
+        gyrocompass(averaged(f + attitude.inv().apply([0, bias, 0]), w), lat), attitude
+    )  # east accelerometer: roll
     assert turn[0] == pytest.approx(-bias / g, rel=1e-6)
     # The found level has no east rate: (e x U)_east = 0 couples a roll into the heading by -tan(lat)
     assert turn[2] == pytest.approx(-turn[0] * math.tan(lat), rel=2e-3, abs=1e-9)
     east = sign * 0.01 * DEG_H
-    drift = error(gyrocompass(f, w + attitude.inv().apply([0, east, 0]), lat), attitude)
+    drift = error(gyrocompass(averaged(f, w + attitude.inv().apply([0, east, 0])), lat), attitude)
     assert abs(drift[2]) == pytest.approx(0.01 * DEG_H / (EARTH_RATE * math.cos(lat)), rel=1e-4)
     assert drift[2] * sign < 0.0  # a rate to the east reads as a nose turned west of north
-    north = error(gyrocompass(f, w + attitude.inv().apply([east, 0, 0]), lat), attitude)
+    north = error(gyrocompass(averaged(f, w + attitude.inv().apply([east, 0, 0])), lat), attitude)
     assert np.linalg.norm(north) < 1e-9  # first order: the north gyro does not turn the heading
-
-
-@settings(max_examples=15)
-@given(st.floats(-75, 75).map(math.radians), st.integers(0, 2**32 - 1))
-def test_covariance_is_the_scatter_of_the_heading(lat, seed):
-    random = np.random.default_rng(seed)
-    f, w = at_rest(Rotation.identity(), lat)
-    sigma_f, sigma_w = 1e-4, 0.02 * DEG_H
-    results = [
-        gyrocompass(f + random.normal(0, sigma_f, 3), w + random.normal(0, sigma_w, 3), lat, sigma_f, sigma_w)
-        for _ in range(60)
-    ]
-    errors = np.array([error(result, Rotation.identity()) for result in results])
-    assert errors[:, 2].std() == pytest.approx(results[0].sigma_heading, rel=0.5)
-    assert errors[:, :2].std() == pytest.approx(results[0].sigma_tilt, rel=0.5)
 
 
 @given(headings, pitches, rolls, latitudes, st.tuples(*[st.floats(-0.05, 0.05)] * 3))
 def test_level_alignment_captures_the_gyro_bias(heading, pitch, roll, lat, bias):
     attitude = Rotation.from_euler("ZYX", [heading, pitch, roll], degrees=True)
     f, w = at_rest(attitude, lat)
-    result = level(f, w + bias, lat, math.radians(heading))
+    result = level(averaged(f, w + bias), lat, math.radians(heading))
     np.testing.assert_allclose(result.gyro_bias, bias, atol=1e-16)
     assert euler_from_quaternion(result.q_nb)[1] == pytest.approx(math.radians(pitch), abs=1e-12)
 
@@ -92,9 +87,11 @@ def test_level_alignment_captures_the_gyro_bias(heading, pitch, roll, lat, bias)
 @pytest.mark.parametrize(
     ("lat_deg", "sigma_w", "bias", "say"),
     [
-        (89.99, 0.0, 0.0, "average longer or give navigation.start.heading_deg"),
-        (-90.0, 0.0, 0.0, "average longer or give navigation.start.heading_deg"),
-        (50.0, 5 * DEG_H, 0.0, "noise of the mean rate is 5 deg/h"),
+        (89.99, 0.0, 0.0, "at a pole or beyond, where there is no north; give navigation.start.heading_deg"),
+        (-90.0, 0.0, 0.0, "latitude -90.000 deg is at a pole"),
+        # 3 x 5 deg/h against 15.04 cos(50 deg) = 9.668 deg/h: 60 s x (15 / 9.668)^2
+        (50.0, 5 * DEG_H, 0.0, "noise of the mean rate is 5 deg/h; average longer (144 s) or give navigation.start"),
+        (50.0, 3600 * DEG_H, 0.0, "average longer (867 days) or give"),  # a MEMS board of 1 deg/s
         (50.0, 0.0, 100 * DEG_H, "times the Earth's (gyro bias, or units)"),  # a MEMS board
         (50.0, 0.0, math.degrees(EARTH_RATE), "times the Earth's (gyro bias, or units)"),  # deg/s taken for rad/s
     ],
@@ -102,14 +99,85 @@ def test_level_alignment_captures_the_gyro_bias(heading, pitch, roll, lat, bias)
 def test_refusals_say_why_and_what_to_do(lat_deg, sigma_w, bias, say):
     f, w = at_rest(Rotation.from_euler("ZYX", [30, 2, -3], degrees=True), math.radians(lat_deg))
     with pytest.raises(AlignmentRefused) as refusal:
-        gyrocompass(f, w + np.array([bias, 0.0, 0.0]), math.radians(lat_deg), 0.0, sigma_w)
+        gyrocompass(averaged(f, w + np.array([bias, 0.0, 0.0]), 0.0, sigma_w), math.radians(lat_deg))
     assert say in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("told_deg", "sign", "sensors", "fits"),
+    [
+        (-50.0, 1.0, UNSTATED, "50.0 deg"),  # the other hemisphere
+        (50.0, -1.0, UNSTATED, "-50.0 deg"),  # gyros of the other sign
+        (51.0, 1.0, Sensors(gyro_bias=0.01 * DEG_H), "50.0 deg"),
+        (49.0, 1.0, Sensors(gyro_bias=0.01 * DEG_H), "50.0 deg"),
+    ],
+)
+def test_the_vertical_rate_tells_the_wrong_latitude(told_deg, sign, sensors, fits):
+    f, w = at_rest(Rotation.from_euler("ZYX", [130, 12, -3], degrees=True), math.radians(50.0))
+    with pytest.raises(
+        AlignmentRefused, match=f"would fit latitude {fits}: mend the latitude, its hemisphere or the sig"
+    ):
+        gyrocompass(averaged(f, sign * w), math.radians(told_deg), sensors)
+
+
+def test_the_vertical_rate_tells_only_what_noise_and_bias_let_it():
+    f, w = at_rest(Rotation.from_euler("ZYX", [130, 12, -3], degrees=True), math.radians(50.0))
+    assert gyrocompass(averaged(f, w), math.radians(51.0)).q_nb[0] > 0.0
+    assert gyrocompass(averaged(f, w), math.radians(51.0), Sensors(gyro_bias=1.0 * DEG_H)).q_nb[0] > 0.0
+    noisy = averaged(f, w, 0.0, 0.2 * DEG_H)
+    assert gyrocompass(noisy, math.radians(51.0), Sensors(gyro_bias=0.01 * DEG_H)).q_nb[0] > 0.0
+
+
+@pytest.mark.parametrize("broken", ["f", "w", "lat", "sigma"])
+def test_what_is_not_a_number_is_refused(broken):
+    f, w = at_rest(Rotation.identity(), 0.9)
+    parts = {"f": f.copy(), "w": w.copy(), "lat": np.array([0.9]), "sigma": np.zeros(1)}
+    parts[broken][0] = math.nan
+    mean = averaged(parts["f"], parts["w"], 0.0, parts["sigma"][0])
+    with pytest.raises(AlignmentRefused, match="is not a number"):
+        gyrocompass(mean, parts["lat"][0])
+    with pytest.raises(AlignmentRefused, match="is not a number"):
+        level(mean, parts["lat"][0], 1.0)
+
+
+def test_a_force_that_is_not_1_g_is_refused():
+    f, w = at_rest(Rotation.identity(), 0.9)
+    for align in (lambda mean: gyrocompass(mean, 0.9), lambda mean: level(mean, 0.9, 1.0)):
+        with pytest.raises(AlignmentRefused, match=r"specific force at rest is 0\.10 g: units or signs"):
+            align(averaged(f / 9.80665, w))
+
+
+def test_a_heading_asked_for_has_its_time_or_its_limit():
+    """sigma^2 = noise^2 60 s / T + bias^2, and by the classical limit 0.01 deg/h of east bias is 0.059 deg at 50 deg."""
+    lat = math.radians(50.0)
+    mean = averaged(*at_rest(Rotation.identity(), lat), 0.0, 0.04 * DEG_H)
+    sensors = Sensors(gyro_bias=0.01 * DEG_H)
+    noise, bias = (size * DEG_H / (EARTH_RATE * math.cos(lat)) for size in (0.04, 0.01))
+    asked = math.radians(0.1)
+    time = 60.0 * noise**2 / (asked**2 - bias**2)
+    with pytest.raises(AlignmentRefused, match=f"0.1 deg are asked; average {time:.0f} s instead of 60 s"):
+        gyrocompass(mean, lat, sensors, asked=asked)
+    with pytest.raises(AlignmentRefused, match=f"the biases alone leave {math.degrees(bias):.3g} deg"):
+        gyrocompass(mean, lat, sensors, asked=math.radians(0.05))
+    assert gyrocompass(mean, lat, sensors, asked=1.01 * math.hypot(noise, bias)).sigma_heading < 1.01 * math.hypot(
+        noise, bias
+    )
+
+
+@pytest.mark.parametrize(("sigma_w", "sigma_f", "what"), [(4.0, 1.0, "rate"), (1.0, 4.0, "specific force")])
+def test_a_scatter_above_the_stated_noise_is_not_rest(sigma_w, sigma_f, what):
+    sensors = Sensors(angle_random_walk=1e-7 * math.sqrt(60), velocity_random_walk=1e-5 * math.sqrt(60))
+    mean = averaged(*at_rest(Rotation.identity(), 0.9), sigma_f * 1e-5, sigma_w * 1e-7)
+    with pytest.raises(
+        AlignmentRefused, match=f"the {what} scatters 4.0 times as much as the sensor's noise; stand still"
+    ):
+        gyrocompass(mean, 0.9, sensors)
 
 
 def test_a_rate_along_the_vertical_has_no_north():
     """The wrong latitude: at the real place, a pole, all of the rate is vertical."""
     with pytest.raises(AlignmentRefused, match="upright"):
-        gyrocompass(np.array([0.0, 0.0, -9.8]), np.array([0.0, 0.0, -EARTH_RATE]), 0.9)
+        gyrocompass(averaged(np.array([0.0, 0.0, -9.8]), np.array([0.0, 0.0, -EARTH_RATE])), 0.9)
 
 
 @pytest.mark.parametrize(
@@ -188,6 +256,6 @@ def test_a_bias_within_tolerance_is_not_refused_but_bounded(lat, heading):
     attitude = Rotation.from_euler("Z", heading, degrees=True)
     f, w = at_rest(attitude, lat)
     bias = attitude.inv().apply([0.0, 0.5 * DEG_H, 0.0])
-    found = error(gyrocompass(f, w + bias, lat), attitude)
+    found = error(gyrocompass(averaged(f, w + bias), lat), attitude)
     assume(math.cos(lat) > 0.2)
     assert abs(found[2]) == pytest.approx(math.atan(0.5 * DEG_H / (EARTH_RATE * math.cos(lat))), rel=1e-6)

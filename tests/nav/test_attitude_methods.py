@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from nav.attitude import NAMES, method
 from nav.attitude.euler_vector import bortz_coefficient, euler_vector_step
-from nav.attitude.poisson import orthonormalise, poisson_step
+from nav.attitude.poisson import poisson_step
 from nav.attitude.signals import Precession, Swinging
 from nav.errors import HilError
 from nav.rotation import attitude_error
+from nav.turn import orthonormalise
 
 EVERY = (
     "poisson-rk4",
