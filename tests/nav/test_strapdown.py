@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from hil.scenario import MotionConfig, load
 from hil.world.motion import Motion
 from hil.world.pole import PoleFlight
-from nav.earth import E2, GM, J2, RATE, A, curvature_radii, normal_gravity
+from nav.earth import GM, J2, RATE, A, curvature_radii, normal_gravity
 from nav.errors import HilError
 from nav.gravitation import J2_FIELD, NORMAL, gravitation_cartesian, gravitation_local, near_latitude
 from nav.increments import ImuIncrements
@@ -349,7 +349,7 @@ def test_over_the_pole(mechanization, attitude, south):
 
 
 def test_the_flight_over_the_pole_is_newtons():
-    """Its specific force is the second derivative of its place in inertial axes less gravitation, its rate that of its attitude."""
+    """Specific force: second derivative of the place in inertial axes less gravitation; rate: that of the attitude."""
     motion, h = PoleFlight(crossing_s=50.0), 1e-2
     for time in (3.0, 49.0, 52.0, 90.0):
         rows = motion.truth(time + h * np.arange(-2, 3))
@@ -366,7 +366,7 @@ def test_the_flight_over_the_pole_is_newtons():
 
 
 def test_geographic_stops_before_the_pole():
-    done, position, _, _, truth = over_the_pole(Strapdown())
+    done, position, *_ = over_the_pole(Strapdown())
     assert 0 < done < POLE_STEPS
     assert np.isnan(position[done:]).all()
     motion = PoleFlight(crossing_s=0.5 * POLE_STEP * POLE_STEPS)

@@ -12,7 +12,14 @@ METHODS = ("two-sample", "high-order:4", "high-order:6", "high-order:8")
 LIMITS_M = {("agile", 10): 2e-3, ("agile", 1): 1e-6, ("smooth", 10): 1e-5, ("smooth", 1): 1e-6}
 """For high order, by flight and step in ms."""
 ORDER_STEPS_S, ORDER_S = (0.025, 0.05, 0.1), 96.0
-ORDERS = {"two-sample": 3, "high-order:3": 4, "high-order:4": 6, "high-order:5": 6, "high-order:6": None, "high-order:8": None}
+ORDERS = {
+    "two-sample": 3,
+    "high-order:3": 4,
+    "high-order:4": 6,
+    "high-order:5": 6,
+    "high-order:6": None,
+    "high-order:8": None,
+}
 """By method, in blocks of the whole record; none where the error of steps so short is soon that of the mechanization."""
 
 

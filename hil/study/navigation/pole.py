@@ -7,7 +7,7 @@ import numpy as np
 from hil.study.navigation.flights import fly
 from hil.study.report import Line, Plot, Row, at_most, near, shown
 from hil.world.pole import PoleFlight
-from nav.earth import A, E2
+from nav.earth import E2, A
 from nav.mechanization.geographic import POLAR_CAP
 from nav.strapdown import Strapdown
 

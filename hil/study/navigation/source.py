@@ -18,9 +18,7 @@ PUBLISHED_M = {1: 5.5, 10: 55.0}
 """Source 000: largest position error by step in ms; its flight is not given."""
 
 
-def gravity_lag(
-    motion: Motion, duration: float = DURATION_S, every: float = 0.5
-) -> tuple[FloatArray, FloatArray]:
+def gravity_lag(motion: Motion, duration: float = DURATION_S, every: float = 0.5) -> tuple[FloatArray, FloatArray]:
     """Position error, per second of step, of a mechanization that takes gravitation at the start of each step.
 
     Gravitation then lags by half a step: the acceleration is wrong by -(T/2) dg/dt along the flight, seen from inertial
