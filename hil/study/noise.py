@@ -80,9 +80,8 @@ def white(grade: Grade) -> Disturb:
     return disturb
 
 
-def quantised(exact: Increments, step: float, random: np.random.Generator) -> Increments:
+def quantised(exact: Increments, _step: float, random: np.random.Generator) -> Increments:
     """Rounded to the wire's units, the residue carried from sample to sample, from a random one on."""
-    del step
     dtheta, dvel = (
         lsb * np.diff(np.rint(np.cumsum(x, axis=0) / lsb + random.uniform(-0.5, 0.5, 3)), axis=0, prepend=0.0)
         for x, lsb in zip(exact, (ANGLE_LSB, VELOCITY_LSB["fd"]), strict=True)
