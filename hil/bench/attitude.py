@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from hil.bench.timing import Row, Sizes, Work, rows_in_turns
-from hil.study.orientation import METHODS
+from hil.study.orientation.measure import METHODS
 from nav.attitude import AttitudeMethod, method
 from nav.attitude.signals import Swinging
 from nav.increments import FloatArray

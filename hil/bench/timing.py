@@ -58,8 +58,7 @@ class Work:
 def rows_in_turns(works: Sequence[Work], repeats: int) -> list[Row]:
     """Measure all works `repeats` times in turns, each once before; a row each.
 
-    Time is the median. A ratio is the median of the ratios of one turn each: what slows the machine down for a while slows
-    both. `peer_ns` is therefore our time by that ratio.
+    Time is the median. A ratio is the `paired_ratio`, and `peer_ns` our time by it.
     """
     times: dict[str, list[float]] = {work.id: [] for work in works}
     for work in works:
@@ -70,16 +69,18 @@ def rows_in_turns(works: Sequence[Work], repeats: int) -> list[Row]:
             work.run()
             times[work.id].append((time.perf_counter_ns() - began) / work.count)
 
-    def ratio(one: str, other: str) -> float:
-        return statistics.median(a / b for a, b in zip(times[one], times[other], strict=True))
-
     rows = []
     for work in works:
         ns = statistics.median(times[work.id])
-        peer_ns = ns * ratio(work.peer_id, work.id) if work.peer_id in times else None
-        to_c = ratio(work.id, work.c_id) if work.c_id in times else None
+        peer_ns = ns * paired_ratio(times[work.peer_id], times[work.id]) if work.peer_id in times else None
+        to_c = paired_ratio(times[work.id], times[work.c_id]) if work.c_id in times else None
         rows.append(row(work.id, work.what, ns, work.peer if peer_ns is not None else "", peer_ns, to_c))
     return rows
+
+
+def paired_ratio(times: Sequence[float], others: Sequence[float]) -> float:
+    """Median of the ratios of one turn each: what slows the machine down for a while slows both."""
+    return statistics.median(a / b for a, b in zip(times, others, strict=True))
 
 
 def row(

@@ -1,13 +1,11 @@
 """The speed measurement: its rows, how its ratios are made, and that what it compares with does the same work."""
 
-import time
-
 import numpy as np
 import pytest
 
 from hil.bench import attitude, strapdown
 from hil.bench.strapdown import StrapdownRecord, c_two_sample
-from hil.bench.timing import Sizes, Work, rows_in_turns
+from hil.bench.timing import Sizes, Work, paired_ratio, rows_in_turns
 from nav.strapdown import MECHANIZATIONS, Strapdown
 
 KEYS = {"id", "what", "ns", "ratio_to_c", "peer", "peer_ns"}
@@ -62,23 +60,21 @@ def test_every_attitude_method_has_a_row_in_batch_and_per_call():
 
 
 def test_a_ratio_is_of_one_turn_each():
-    """The machine slows down between the two in one turn: their medians are 15 to 1, their turns 3 to 1."""
+    """The machine slows down between the two in one turn: their medians are 1 to 15, their turns 1 to 3."""
+    assert paired_ratio([1.0, 1.0, 1.0, 5.0, 5.0], [3.0, 3.0, 15.0, 15.0, 15.0]) == pytest.approx(1.0 / 3.0)
 
-    def spin(units: int) -> None:
-        end = time.perf_counter_ns() + 300_000 * units
-        while time.perf_counter_ns() < end:
-            pass
 
-    ours, theirs = iter((1, 1, 1, 1, 5, 5)), iter((3, 3, 3, 15, 15, 15))
+def test_works_take_turns():
+    done = []
     works = [
-        Work("ours", "ours", lambda: spin(next(ours)), 1, "slow", "theirs", "theirs"),
-        Work("theirs", "theirs", lambda: spin(next(theirs)), 1),
+        Work("ours", "ours", lambda: done.append("ours"), 1, "peer", "theirs", "ours"),
+        Work("theirs", "theirs", lambda: done.append("theirs"), 1),
     ]
-    mine, other = rows_in_turns(works, 5)
-    assert mine["peer"] == "slow"
-    assert mine["peer_ns"] / mine["ns"] == pytest.approx(3.0, rel=0.3)
-    assert mine["ratio_to_c"] == pytest.approx(1.0 / 3.0, rel=0.3)
-    assert other["ratio_to_c"] is None
+    mine, theirs = rows_in_turns(works, 3)
+    assert done == ["ours", "theirs"] * 4
+    assert (mine["peer"], mine["ratio_to_c"]) == ("peer", 1.0)
+    assert mine["peer_ns"] > 0.0
+    assert (theirs["peer"], theirs["peer_ns"], theirs["ratio_to_c"]) == ("", None, None)
 
 
 def test_a_missing_peer_leaves_no_trace():
