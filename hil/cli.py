@@ -265,7 +265,7 @@ def bench(as_json: Json = False) -> None:
         ratio = "" if row["ratio_to_c"] is None else f"   {row['ratio_to_c']:.2f} of C"
         if row["peer_ns"] is not None:
             ratio += f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
-        print(f"{row['id']:24} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
+        print(f"{row['id']:36} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
 @app.command()

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from hil.scenario import MotionConfig, load
 from hil.world.motion import Motion
-from nav.earth import E2, GM, J2, RATE, A, curvature_radii, normal_gravity
+from hil.world.pole import PoleFlight
+from nav.earth import GM, J2, RATE, A, curvature_radii, normal_gravity
 from nav.errors import HilError
 from nav.gravitation import J2_FIELD, NORMAL, gravitation_cartesian, gravitation_local, near_latitude
 from nav.increments import ImuIncrements
@@ -376,100 +377,72 @@ def test_a_day_at_rest_with_the_height_held(mechanization):
 
 # The pole
 
-POLE_STEP, POLE_STEPS, POLE_TURN = 0.01, 6000, 240.0 / 6.4e6
-POLE_LON, POLE_HEIGHT = 0.4, 9000.0
+POLE_STEP, POLE_STEPS = 0.01, 6000
 
 
-def pole_body(time, sign):
-    """Increments' integrands on the meridian flight over the pole, the place and the level's attitude q_nb before it.
-
-    The angle along the meridian grows evenly from before the pole; beyond it, it exceeds 90 degrees. Axes: forward along the
-    meridian, right, down.
-    """
-    angle = 0.5 * math.pi + POLE_TURN * (time - 0.5 * POLE_STEP * POLE_STEPS)
-    s, c = np.sin(angle), np.cos(angle)
-    meridian = A * (1.0 - E2) / (1.0 - E2 * s * s) ** 1.5
-    speed = (meridian + POLE_HEIGHT) * POLE_TURN
-    slope = 3.0 * meridian * E2 * s * c / (1.0 - E2 * s * s) * POLE_TURN**2
-    gravity = np.array([normal_gravity(x, POLE_HEIGHT) for x in s])
-    # At the south pole everything is mirrored but the Earth's turn: as if it turned the other way.
-    rate = sign * RATE
-    force = np.stack([slope, -2.0 * rate * speed * s, speed * POLE_TURN - gravity], axis=1)
-    turn = np.stack([rate * c, np.full_like(s, -POLE_TURN), -rate * s], axis=1)
-    return angle, speed, turn, force
+def over_the_pole(core, *, south=False):
+    """A minute over the pole, reached at the end of a step; what `advance` answers, and the truth."""
+    motion = PoleFlight(crossing_s=0.5 * POLE_STEP * POLE_STEPS, south=south)
+    begin(core, motion.truth([0.0])[0])
+    answer = advance(core, *increments(motion, POLE_STEP * POLE_STEPS, POLE_STEP))
+    return *answer, motion.truth(POLE_STEP * np.arange(1, POLE_STEPS + 1))
 
 
-def pole_flight(sign, roll=0.3, pulsation=1.7):
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    time = (POLE_STEP * (np.arange(POLE_STEPS)[:, None] + 0.5 * (nodes + 1.0))).ravel()
-    _, _, turn, force = pole_body(time, sign)
-    bank = roll * np.sin(pulsation * time)
-    about = Rotation.from_rotvec(bank[:, None] * [1.0, 0.0, 0.0]).inv()
-    turn = about.apply(turn) + (roll * pulsation * np.cos(pulsation * time))[:, None] * [1.0, 0.0, 0.0]
-    both = np.stack([turn, about.apply(force)]).reshape(2, POLE_STEPS, 6, 3)
-    dtheta, dvel = 0.5 * POLE_STEP * np.einsum("j,bkji->bki", weights, both)
-    angle, speed, _, _ = pole_body(POLE_STEP * np.arange(POLE_STEPS + 1), sign)
-    bank = roll * np.sin(pulsation * POLE_STEP * np.arange(POLE_STEPS + 1))
-    return dtheta, dvel, angle, speed, bank
-
-
+@pytest.mark.parametrize("south", [False, True])
 @pytest.mark.parametrize("mechanization", EXACT)
 @pytest.mark.parametrize("attitude", ["two-sample", "high-order:4"])
-def test_over_the_north_pole(mechanization, attitude):
-    dtheta, dvel, angle, speed, bank = pole_flight(1.0)
+def test_over_the_pole(mechanization, attitude, south):
     core = Strapdown(attitude, mechanization, whole_record=True)
-    core.start(angle[0], POLE_LON, POLE_HEIGHT, np.array([speed[0], 0, 0]), np.array([1.0, 0, 0, 0]))
-    done, position, velocity, q_nb = advance(core, np.full(POLE_STEPS, POLE_STEP), dtheta, dvel)
+    done, position, velocity, q_nb, truth = over_the_pole(core, south=south)
     assert (done < POLE_STEPS) == (mechanization == "geographic")
     assert np.isfinite(position).all()
     assert np.isfinite(velocity).all()
     assert np.isfinite(q_nb).all()
-    beyond = angle[1:] > 0.5 * math.pi
-    lat, lon = np.where(beyond, math.pi - angle[1:], angle[1:]), POLE_LON + math.pi * beyond
-    right = cartesian(np.stack([lat, lon, np.full(POLE_STEPS, POLE_HEIGHT)], axis=1))
+    right = cartesian(np.stack([truth["lat"], truth["lon"], truth["height"]], axis=1))
     limit = 3e-5 if attitude == "two-sample" else 2e-8
     assert np.linalg.norm(cartesian(position) - right, axis=1).max() < limit
-    # Beyond the pole the same course is southward; close by, north turns too fast to be compared.
-    far = np.abs(angle[1:] - 0.5 * math.pi) > 1e-5
-    north = np.where(beyond, -speed[1:], speed[1:])
-    assert np.abs(velocity[far, 0] - north[far]).max() < limit / 10.0
+    # Beyond the pole the same course is the other way; close by, north turns too fast to be compared.
+    far = np.cos(truth["lat"]) > 1e-5
+    assert np.abs(velocity - truth["vel_n"])[far][:, [0, 2]].max() < limit / 10.0
     assert np.abs(velocity[far, 1]).max() < max(limit, 1e-6)
-    course = Rotation.from_euler("z", 180.0, degrees=True) * Rotation.from_euler("x", bank[-1])
-    assert np.abs(attitude_error(q_nb[-1], course.as_quat(scalar_first=True))).max() < max(limit / 100.0, 1e-8)
+    assert np.abs(attitude_error(q_nb[-1], truth["q_nb"][-1])).max() < max(limit / 100.0, 1e-8)
 
 
-@pytest.mark.parametrize("mechanization", EXACT)
-def test_over_the_south_pole(mechanization):
-    """The flight mirrored: there the Earth turns the other way round the level."""
-    dtheta, dvel, angle, speed, _ = pole_flight(-1.0)
-    places = []
-    for name in (mechanization, "earth"):
-        core = Strapdown("high-order:4", name, whole_record=True)
-        core.start(-angle[0], POLE_LON, POLE_HEIGHT, np.array([-speed[0], 0, 0]), np.array([0.0, 0, 0, 1.0]))
-        places.append(cartesian(advance(core, np.full(POLE_STEPS, POLE_STEP), dtheta, dvel)[1]))
-    beyond = angle[1:] > 0.5 * math.pi
-    lat, lon = -np.where(beyond, math.pi - angle[1:], angle[1:]), POLE_LON + math.pi * beyond
-    right = cartesian(np.stack([lat, lon, np.full(POLE_STEPS, POLE_HEIGHT)], axis=1))
-    assert np.abs(places[0] - places[1]).max() < 2e-8
-    assert np.linalg.norm(places[0] - right, axis=1).max() < 2e-8
+def test_the_flight_over_the_pole_is_newtons():
+    """Specific force: second derivative of the place in inertial axes less gravitation; rate: that of the attitude."""
+    motion, h = PoleFlight(crossing_s=50.0), 1e-2
+    for time in (3.0, 49.0, 52.0, 90.0):
+        rows = motion.truth(time + h * np.arange(-2, 3))
+        turn = Rotation.from_rotvec([[0.0, 0.0, RATE * t] for t in rows["time"]])
+        place = turn.apply(cartesian(np.stack([rows["lat"], rows["lon"], rows["height"]], axis=1)))
+        level = Rotation.from_euler("ZY", np.stack([rows["lon"], -rows["lat"] - 0.5 * math.pi], axis=1))
+        c_ib = turn * level * Rotation.from_quat(rows["q_nb"], scalar_first=True)
+        acceleration = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) @ place / (12.0 * h * h)
+        s, c = math.sin(rows["lat"][2]), math.cos(rows["lat"][2])
+        g = gravitation_cartesian(NORMAL, *place[2], s, c)
+        np.testing.assert_allclose(c_ib[2].inv().apply(acceleration - g), rows["f_b"][2], atol=2e-4)
+        rate = (c_ib[1].inv() * c_ib[3]).as_rotvec() / (2.0 * h)
+        np.testing.assert_allclose(rate, rows["w_ib_b"][2], atol=1e-4)
 
 
 def test_geographic_hands_over_before_the_pole():
     """In a batch, one by one, and in the navigator: the same flight, and it is said."""
-    dtheta, dvel, angle, speed, _ = pole_flight(1.0)
-    start = angle[0], POLE_LON, POLE_HEIGHT, np.array([speed[0], 0, 0]), np.array([1.0, 0, 0, 0])
+    motion = PoleFlight(crossing_s=0.5 * POLE_STEP * POLE_STEPS)
+    step, dtheta, dvel = increments(motion, POLE_STEP * POLE_STEPS, POLE_STEP)
+    (row,) = motion.truth([0.0])
+    start = row["lat"], row["lon"], row["height"], row["vel_n"], row["q_nb"]
     batch, single = Strapdown(), Strapdown()
     for core in batch, single:
         core.start(*start)
-    done, *out = advance(batch, np.full(POLE_STEPS, POLE_STEP), dtheta, dvel)
+    done, *out = advance(batch, step, dtheta, dvel)
     assert abs(out[0][done - 1, 0]) > MAX_LAT >= abs(out[0][done - 2, 0])
     assert batch.mechanization == "wander"
     answers = []
-    for row in np.hstack([dtheta, dvel]).tolist():
-        answers.append(single.push(POLE_STEP, *row))
+    for sample in np.hstack([dtheta, dvel]).tolist():
+        answers.append(single.push(POLE_STEP, *sample))
         if answers[-1] == POLE:
             single.hand_over("wander")
-            assert single.push(POLE_STEP, *row) == DONE
+            assert single.push(POLE_STEP, *sample) == DONE
     assert answers == done * [DONE] + [POLE] + (POLE_STEPS - done - 1) * [DONE]
     np.testing.assert_array_equal(single.solution, batch.solution)
     navigator = Navigator(Settings())

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 
 from hil.study import study_names
-from hil.study.navigation import _azimuth, flight, fly, frame_cores, gravity_lag, run, strip_paths
-from hil.world.motion import Motion
+from hil.study.navigation import run
+from hil.study.navigation.azimuth import strip_paths, wander_azimuth
+from hil.study.navigation.exactness import frame_cores
+from hil.study.navigation.flights import flight, fly
+from hil.study.navigation.pole import over_the_pole
+from hil.study.navigation.source import gravity_lag
 from nav.errors import HilError
 from nav.nonholonomy import solid_angle
 from nav.strapdown import MECHANIZATIONS, Strapdown
@@ -22,14 +26,24 @@ def test_every_limit_is_kept():
 
 
 def test_azimuth_rows():
-    rows, _ = _azimuth()
+    rows, _ = wander_azimuth()
     assert [row for row in rows if not row.ok] == []
     assert {row.published for row in rows if row.id.startswith("strip")} == {2.117}
 
 
+def test_over_the_pole_every_frame_but_the_geographic_closes_on_the_truth():
+    rows, _ = over_the_pole()
+    assert [row for row in rows if not row.ok] == []
+    ours = {row.id: row.ours for row in rows}
+    assert 6300.0 < ours.pop("pole-geographic") < 6500.0  # 1e-3 of the radius of curvature
+    assert {key.split("-")[1] for key in ours} == {"wander", "inertial", "earth"}
+    for frame in ("wander", "inertial", "earth"):
+        assert ours[f"pole-{frame}-high-order:4"] < 1e-2 * ours[f"pole-{frame}-two-sample"] < 1e-4
+
+
 def test_agile_flight_is_agile():
     """Speed near 230 m/s, bank to 30 degrees and the shaking on top."""
-    truth = Motion(flight("agile")).truth(np.arange(0.0, 70.0, 0.05))
+    truth = flight("agile").truth(np.arange(0.0, 70.0, 0.05))
     speed = np.linalg.norm(truth["vel_n"], axis=1)
     assert 225.0 < speed.min() < speed.max() < 240.0
     w, x, y, z = truth["q_nb"].T

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from hil.study import study, study_names
-from hil.study.orientation import errors, run, uniform
+from hil.study.orientation import run
+from hil.study.orientation.measure import METHODS, errors, uniform
 from hil.study.report import Line, Plot, Row, Study, at_most, near, shown, write
+from nav import attitude
 from nav.attitude.signals import Precession
 from nav.errors import HilError
 
@@ -24,6 +26,15 @@ def result():
 def test_every_limit_is_kept(result):
     assert [row for row in result.rows if not row.ok] == []
     assert len({row.id for row in result.rows}) == len(result.rows)
+
+
+def test_every_method_has_its_coning_table_and_its_orders(result):
+    ids = {row.id for row in result.rows}
+    families = {name.partition(":")[0].partition("[")[0] for name in attitude.NAMES} - {"two-sample"}
+    assert {name.partition(":")[0] for name in METHODS} == families
+    for name in METHODS:
+        assert {f"coning-{cone}deg-{hz}hz-{name}" for cone in (1, 10) for hz in (1, 10, 74)} <= ids
+        assert {f"order-{name}-equal", f"order-{name}-unequal"} <= ids
 
 
 @pytest.mark.parametrize(
