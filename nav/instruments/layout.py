@@ -10,15 +10,18 @@ import numpy as np
 
 from nav.errors import HilError
 from nav.increments import FloatArray
-from nav.instruments.pendulum import Axes, Pendulum, best_hinge
-from nav.instruments.size_effect import size_coefficients, size_terms
+from nav.instruments.pendulum import Axes, Pendulum, Vector, best_hinge
+from nav.instruments.size_effect import size_coefficients
 
 _X, _Y, _Z = np.eye(3)
 
 
+def _vector(v: FloatArray) -> Vector:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
 def _axes(xi: FloatArray, zeta: FloatArray) -> Axes:
-    rows = [tuple(map(float, row)) for row in (xi, np.cross(zeta, xi), zeta)]
-    return rows[0], rows[1], rows[2]  # type: ignore[return-value]
+    return _vector(xi), _vector(np.cross(zeta, xi)), _vector(zeta)
 
 
 def _at_best(pendulum: Pendulum, zetas: Sequence[FloatArray]) -> tuple[Pendulum, ...]:
@@ -59,25 +62,23 @@ def common_layout(pendulum: Pendulum, offset: float, angle: float = 0.0) -> tupl
 
 def moved(pendulums: Sequence[Pendulum], centre: FloatArray) -> tuple[Pendulum, ...]:
     """The same block seen from another O, `centre` (3,) from the old one, m."""
-    return tuple(
-        replace(one, hinge=tuple(float(h - c) for h, c in zip(one.hinge, centre, strict=True))) for one in pendulums
-    )
+    x, y, z = map(float, centre)
+    return tuple(replace(one, hinge=(one.hinge[0] - x, one.hinge[1] - y, one.hinge[2] - z)) for one in pendulums)
 
 
-def motion_gram(rate: FloatArray, acceleration: FloatArray) -> FloatArray:
+def motion_gram(terms: FloatArray) -> FloatArray:
     """Mean products of the nine terms of the size effect over a motion.
 
     Parameters
     ----------
-    rate, acceleration : (n, 3) float
-        Of the block, rad/s and rad/s^2.
+    terms : (n, 9) float
+        Of `size_terms`; or their integrals, once for errors of velocity and twice for those of position.
 
     Returns
     -------
     (9, 9) float
-        1/s^4.
+        Squares of the unit of `terms`.
     """
-    terms = size_terms(rate, acceleration)
     gram: FloatArray = terms.T @ terms / len(terms)
     return gram
 
@@ -105,7 +106,7 @@ def spectrum_gram(rate: FloatArray, acceleration: FloatArray) -> FloatArray:
 
 
 def size_error(pendulums: Sequence[Pendulum], gram: FloatArray) -> float:
-    """Root mean square of the uncompensated error vector, m/s^2, over the motion of `gram`."""
+    """Root mean square of the uncompensated error vector over the motion of `gram`: m/s^2, m/s or m, as its terms were."""
     rows = size_coefficients(pendulums)
     return float(np.sqrt(max(0.0, np.einsum("ij,jk,ik->", rows, gram, rows))))
 
@@ -134,7 +135,9 @@ def best_centre(pendulums: Sequence[Pendulum], gram: FloatArray) -> FloatArray:
     """
     values, vectors = np.linalg.eigh(gram)
     if not (np.isfinite(values).all() and values[0] >= -1e-9 * abs(values[-1])):
-        raise HilError("best centre: gram must be a symmetric matrix of mean products; take motion_gram or spectrum_gram")
+        raise HilError(
+            "best centre: gram must be a symmetric matrix of mean products; take motion_gram or spectrum_gram"
+        )
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     now = size_coefficients(pendulums)
     slopes = [((size_coefficients(moved(pendulums, unit)) - now) @ root).ravel() for unit in np.eye(3)]

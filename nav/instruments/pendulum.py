@@ -81,7 +81,9 @@ class Pendulum:
             if not 0.0 < getattr(self, name) < math.inf:
                 raise HilError(f"pendulum: {name} is {getattr(self, name):g}; it must be positive")
         if not (min(a, b, c) > 0.0 and 2.0 * max(a, b, c) <= (1.0 + 1e-9) * (a + b + c) < math.inf):
-            raise HilError(f"pendulum: no body has the inertias {a:g}, {b:g}, {c:g}; each is at most the sum of the others")
+            raise HilError(
+                f"pendulum: no body has the inertias {a:g}, {b:g}, {c:g}; each is at most the sum of the others"
+            )
         if not 0.0 <= self.integral < 4.0 * math.pi * self.frequency_hz * self.damping:
             raise HilError(
                 f"pendulum: the loop is unstable with integral {self.integral:g} 1/s; it must be 0 or more and below "
@@ -93,7 +95,9 @@ class Pendulum:
             raise HilError(f"pendulum: the place of the hinge, {self.hinge}, is not finite")
         axes = np.asarray(self.axes, np.float64)
         if axes.shape != (3, 3) or not np.allclose(axes @ axes.T, np.eye(3), atol=1e-9) or np.linalg.det(axes) < 0.0:
-            raise HilError("pendulum: axes must be xi, eta, zeta as rows, unit, mutually at right angles and right-handed")
+            raise HilError(
+                "pendulum: axes must be xi, eta, zeta as rows, unit, mutually at right angles and right-handed"
+            )
 
     @property
     def percussion_radius(self) -> float:
@@ -176,6 +180,7 @@ def apparent_force(
     Parameters
     ----------
     pendulum : Pendulum
+        In its place.
     force : (n, 3) array_like
         Specific force at O, block axes, m/s^2.
     rate, acceleration : (n, 3) array_like
@@ -188,7 +193,9 @@ def apparent_force(
     (n,) float
         m/s^2.
     """
-    inputs = [np.ascontiguousarray(np.atleast_2d(np.asarray(value, np.float64))) for value in (force, rate, acceleration)]
+    inputs = [
+        np.ascontiguousarray(np.atleast_2d(np.asarray(value, np.float64))) for value in (force, rate, acceleration)
+    ]
     out = np.empty(len(inputs[0]))
     _apparent_forces(_geometry(pendulum), inputs[0], inputs[1], inputs[2], float(deflection), out)
     return out
@@ -315,7 +322,9 @@ class PendulumBlock:
     def __init__(self, pendulums: Sequence[Pendulum], step: float) -> None:
         fastest = max(p.frequency_hz for p in pendulums)
         if not 0.0 < step * fastest <= 0.25:
-            raise HilError(f"pendulum: a step of {step:g} s is too long for {fastest:g} Hz; take {0.25 / fastest:g} s or less")
+            raise HilError(
+                f"pendulum: a step of {step:g} s is too long for {fastest:g} Hz; take {0.25 / fastest:g} s or less"
+            )
         self._step = step
         self._parameters = np.stack([_parameters(p, step) for p in pendulums])
         self._state = np.zeros((len(pendulums), 3))
@@ -347,7 +356,9 @@ class PendulumBlock:
             The shapes do not fit, or an input is not finite.
         """
         if force.shape != rate.shape or force.shape[1:] != (3,) or len(force) % 2 == 0:
-            raise HilError(f"pendulum: expected two (2 n + 1, 3) arrays of force and rate, got {force.shape}, {rate.shape}")
+            raise HilError(
+                f"pendulum: expected two (2 n + 1, 3) arrays of force and rate, got {force.shape}, {rate.shape}"
+            )
         if not (np.isfinite(force).all() and np.isfinite(rate).all()):
             raise HilError("pendulum: a force or a rate is not finite; mend the motion")
         dvel = np.empty((len(force) // 2, len(self._state)))

@@ -103,7 +103,7 @@ def test_in_the_best_place_only_anisoinertia_is_left(rate, acceleration):
 
 
 def test_a_plate_has_no_anisoinertia_and_a_blow_at_the_centre_of_percussion_does_not_load_the_hinge():
-    a, b, c = Pendulum().inertia
+    _, b, c = Pendulum().inertia
     assert replace(Pendulum(), inertia=(b + c, b, c)).anisoinertia == pytest.approx(0.0, abs=1e-17)
     # A blow P at r from the hinge: m v = P + R at the centre of mass, J phi' = P r about the hinge
     p = Pendulum()
