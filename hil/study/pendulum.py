@@ -266,7 +266,7 @@ def _layouts() -> tuple[list[Row], list[Plot]]:
         "honeywell": ("Honeywell-like", honeywell_layout(p)),
         "common": ("common, the source's centre", common),
         "common-best": ("common, centre best for vibration", moved(common, centre)),
-        "common-turn": (
+        "common-position": (
             "common, centre best for the turn's position",
             moved(common, best_centre(common, _turn_gram())),
         ),
@@ -281,7 +281,9 @@ def _layouts() -> tuple[list[Row], list[Plot]]:
             text = f"{what}, {name}, full dynamics, 10 s"
             rows.append(shown(f"layout-{key}-{name}-raw", f"{text}: raw", 1e3 * float(np.linalg.norm(raw[-1])), "mm"))
             left = 1e3 * np.linalg.norm(clean, axis=1).max()
-            rows.append(at_most(f"layout-{key}-{name}", f"{text}: compensated at 2 kHz", left, "mm", GOAL_MM))
+            seen = 1e3 * float(np.linalg.norm(vibropendulous(block, PULSATION, SKEW))) if name == "vibration" else 0.0
+            text = f"{text}: compensated at 2 kHz (reference: the deflections alone)"
+            rows.append(at_most(f"layout-{key}-{name}", text, left, "mm", GOAL_MM + seen, reference=seen))
     for i, name in enumerate("xyz"):
         what = f"common: centre best for vibration, from the source's, {name}"
         rows.append(shown(f"centre-common-{name}", what, 1e3 * centre[i], "mm"))
