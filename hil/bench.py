@@ -25,6 +25,13 @@ from hil.scenario import load
 from hil.world.head import SimulatedHead
 from hil.world.motion import Motion
 from nav.increments import FloatArray, ImuIncrements
+from nav.instruments.accelerometer_errors import Accelerometers
+from nav.instruments.grades import GRADES
+from nav.instruments.gyro_errors import Gyros
+from nav.instruments.layout import ideal_layout
+from nav.instruments.pendulum import Pendulum
+from nav.instruments.rebalance import PendulumBlock
+from nav.instruments.size_effect import MEMORY, compensate, size_coefficients
 from nav.mechanization import geographic
 from nav.navigator import Navigator, Settings
 from nav.rotation import euler_angles
@@ -51,6 +58,7 @@ def measure(say: Callable[[str], None]) -> list[Row]:
         *_driver(slow, batch),
         *_codec(batch),
         *_strapdown(),
+        *_instruments(),
         *_navigation(slow, batch),
         *_loop(scenario, slow, batch),
     ]
@@ -220,6 +228,34 @@ def _pyins_ns(record: StrapdownRecord) -> float | None:
         strapdown.Integrator(start).integrate(strapdown.compute_increments_from_imu(imu, "increment"))
 
     return _median_ns(work, len(record.step))
+
+
+def _instruments() -> list[Row]:
+    block, (gyro_errors, force_errors) = ideal_layout(Pendulum()), GRADES["dtg"].draw(np.random.default_rng(0))
+    step, rng = 1e-3, np.random.default_rng(1)
+    dtheta, dvel = rng.normal(0.0, 1e-3, (SAMPLES, 3)), rng.normal(0.0, 1e-2, (SAMPLES, 3))
+    steps, out, memory, coefficients = (
+        np.full(SAMPLES, step),
+        np.empty_like(dvel),
+        np.zeros(MEMORY),
+        size_coefficients(block),
+    )
+    moving = PendulumBlock(block, 1.0 / 8000.0)
+    force, rate = rng.normal(0.0, 1.0, (2, 2 * SAMPLES + 1, 3))
+    gyros, forces = Gyros(gyro_errors, step, rng), Accelerometers(force_errors, step, rng)
+    return [
+        _row(name, what, _median_ns(work, SAMPLES))
+        for name, what, work in (
+            (
+                "size-effect",
+                "size effect of three pendulums, compensated",
+                lambda: compensate(memory, coefficients, steps, dtheta, dvel, out),
+            ),
+            ("pendulums", "three pendulums in full, a step of 1/8000 s", lambda: moving.sense(force, rate)),
+            ("gyro-errors", "errors of four gyro channels, DTG head", lambda: gyros.sense(dtheta, dvel)),
+            ("force-errors", "errors of three accelerometers, DTG head", lambda: forces.sense(dvel)),
+        )
+    ]
 
 
 def _navigation(slow: Any, batch: Any) -> list[Row]:

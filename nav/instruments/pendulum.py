@@ -12,7 +12,6 @@ u / (m l); without deflection it is F(0), the equilibrium form of eq. 1.7.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,8 +24,8 @@ from nav.kernel import inline_kernel, kernel
 Vector = tuple[float, float, float]
 Axes = tuple[Vector, Vector, Vector]
 
-_HINGE, _RADIUS, _MIXED, _RANGE, _STOP, _GAINS, _WHOLE, _HALF = 9, 12, 13, 14, 15, 16, 19, 37
-"""Where the kernels find the parameters of a pendulum: its axes, then these."""
+_HINGE, RADIUS, _MIXED, GEOMETRY = 9, 12, 13, 14
+"""Where the kernels find the geometry of a pendulum: its axes, then these; J / (m l) at `RADIUS`; `GEOMETRY` floats."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +133,7 @@ def best_hinge(pendulum: Pendulum) -> Vector:
 
 
 @inline_kernel
-def _apparent_force(
+def apparent_force_at(
     p: FloatArray, force: FloatArray, rate: FloatArray, ex: float, ey: float, ez: float, deflection: float
 ) -> float:
     """F(phi) from force, rate and angular acceleration in block axes."""
@@ -151,7 +150,7 @@ def _apparent_force(
     f_zeta = p[6] * force[0] + p[7] * force[1] + p[8] * force[2] + e_xi * y - e_eta * x + wz * along - z * square
     s, c = math.sin(deflection), math.cos(deflection)
     value: float = (
-        c * f_xi - s * f_zeta - p[_RADIUS] * e_eta - p[_MIXED] * (c * wx - s * wz) * (s * wx + c * wz)  # w_xi' w_zeta'
+        c * f_xi - s * f_zeta - p[RADIUS] * e_eta - p[_MIXED] * (c * wx - s * wz) * (s * wx + c * wz)  # w_xi' w_zeta'
     )
     return value
 
@@ -162,10 +161,11 @@ def _apparent_forces(
 ) -> None:
     for k in range(len(out)):
         e = acceleration[k]
-        out[k] = _apparent_force(p, force[k], rate[k], e[0], e[1], e[2], deflection)
+        out[k] = apparent_force_at(p, force[k], rate[k], e[0], e[1], e[2], deflection)
 
 
-def _geometry(pendulum: Pendulum) -> FloatArray:
+def geometry(pendulum: Pendulum) -> FloatArray:
+    """What `apparent_force_at` needs: (GEOMETRY,) floats."""
     a, _, c = pendulum.inertia
     mixed = pendulum.arm + (a - c) / (pendulum.mass * pendulum.arm)
     hinge = np.asarray(pendulum.axes) @ pendulum.hinge
@@ -197,178 +197,5 @@ def apparent_force(
         np.ascontiguousarray(np.atleast_2d(np.asarray(value, np.float64))) for value in (force, rate, acceleration)
     ]
     out = np.empty(len(inputs[0]))
-    _apparent_forces(_geometry(pendulum), inputs[0], inputs[1], inputs[2], float(deflection), out)
+    _apparent_forces(geometry(pendulum), inputs[0], inputs[1], inputs[2], float(deflection), out)
     return out
-
-
-def _exponential(matrix: FloatArray) -> FloatArray:
-    """Matrix exponential: Taylor series of the matrix over 2^k, squared k times."""
-    squarings = max(0, math.ceil(math.log2(max(1e-300, float(np.abs(matrix).sum(axis=1).max())))) + 3)
-    small = matrix / 2.0**squarings
-    term = total = np.eye(len(matrix))
-    for k in range(1, 16):
-        term = term @ small / k
-        total = total + term
-    for _ in range(squarings):
-        total = total @ total
-    return total
-
-
-def _parameters(pendulum: Pendulum, step: float) -> FloatArray:
-    """Geometry and loop. The state is (int phi / step, phi, phi' step), its input step^2 F / (J / ml)."""
-    turn = 2.0 * math.pi * pendulum.frequency_hz * step
-    gains = np.array([turn * turn * pendulum.integral * step, turn * turn, 2.0 * pendulum.damping * turn])
-    system = np.zeros((6, 6))  # the state, and the input with its two derivatives
-    system[0, 1] = system[1, 2] = system[2, 3] = system[3, 4] = system[4, 5] = 1.0
-    system[2, :3] -= gains
-    parabola = np.array([[1.0, 0.0, 0.0], [-3.0, 4.0, -1.0], [4.0, -8.0, 4.0]])  # from start, middle and end
-    whole, half = _exponential(system)[:3], _exponential(0.5 * system)[1]
-    return np.concatenate(
-        [
-            _geometry(pendulum),
-            [pendulum.limit, pendulum.stop],
-            pendulum.percussion_radius / step**2 * gains,
-            np.hstack([whole[:, :3], whole[:, 3:] @ parabola]).ravel(),
-            half[:3],
-            half[3:] @ parabola,
-        ]
-    )
-
-
-@inline_kernel
-def _row(p: FloatArray, at: int, s0: float, s1: float, s2: float, g0: float, gm: float, g1: float) -> float:
-    value: float = p[at] * s0 + p[at + 1] * s1 + p[at + 2] * s2 + p[at + 3] * g0 + p[at + 4] * gm + p[at + 5] * g1
-    return value
-
-
-@kernel
-def _sense(
-    parameters: FloatArray,
-    state: FloatArray,
-    step: float,
-    force: FloatArray,
-    rate: FloatArray,
-    dvel: FloatArray,
-    saturated: FloatArray,
-) -> None:
-    """Steps of all pendulums; `saturated` counts the steps at the limit."""
-    for j in range(len(parameters)):
-        p = parameters[j]
-        s0, s1, s2 = state[j, 0], state[j, 1], state[j, 2]
-        limit, stop = p[_RANGE], p[_STOP]
-        scale = step * step / p[_RADIUS]
-        for k in range(len(dvel)):
-            a, m, b = 2 * k, 2 * k + 1, 2 * k + 2
-            ax, ay, az = rate[a, 0], rate[a, 1], rate[a, 2]
-            mx, my, mz = rate[m, 0], rate[m, 1], rate[m, 2]
-            bx, by, bz = rate[b, 0], rate[b, 1], rate[b, 2]
-            # Slopes of the parabola of the rate; its integral of the angular acceleration is exactly the change of rate.
-            cx, cy, cz = (bx - ax) / step, (by - ay) / step, (bz - az) / step
-            dx, dy, dz = (
-                2.0 * (ax - 2.0 * mx + bx) / step,
-                2.0 * (ay - 2.0 * my + by) / step,
-                2.0 * (az - 2.0 * mz + bz) / step,
-            )
-            f0 = _apparent_force(p, force[a], rate[a], cx - dx, cy - dy, cz - dz, s1)
-            fm = _apparent_force(p, force[m], rate[m], cx, cy, cz, s1)
-            f1 = _apparent_force(p, force[b], rate[b], cx + dx, cy + dy, cz + dz, s1)
-            command = p[_GAINS] * s0 + p[_GAINS + 1] * s1 + p[_GAINS + 2] * s2
-            if abs(command) > limit:  # the torque and the integral stand still
-                torque = math.copysign(limit, command)
-                g0, gm, g1 = scale * (f0 - torque), scale * (fm - torque), scale * (f1 - torque)
-                s1 += s2 + (g0 + 2.0 * gm) / 6.0
-                s2 += (g0 + 4.0 * gm + g1) / 6.0
-                dvel[k, j] = torque * step
-                saturated[j] += 1
-            else:
-                # F depends on the deflection so little that one prediction of it is exact to rounding.
-                half = _row(p, _HALF, s0, s1, s2, scale * f0, scale * fm, scale * f1)
-                end = _row(p, _WHOLE + 6, s0, s1, s2, scale * f0, scale * fm, scale * f1)
-                fm = _apparent_force(p, force[m], rate[m], cx, cy, cz, half)
-                f1 = _apparent_force(p, force[b], rate[b], cx + dx, cy + dy, cz + dz, end)
-                g0, gm, g1 = scale * f0, scale * fm, scale * f1
-                t0 = _row(p, _WHOLE, s0, s1, s2, g0, gm, g1)
-                t1 = _row(p, _WHOLE + 6, s0, s1, s2, g0, gm, g1)
-                t2 = _row(p, _WHOLE + 12, s0, s1, s2, g0, gm, g1)
-                # The torque's integral by the equation of motion itself.
-                total = (f0 + 4.0 * fm + f1) * step / 6.0 - p[_RADIUS] * (t2 - s2) / step
-                dvel[k, j] = min(max(total, -limit * step), limit * step)
-                s0, s1, s2 = t0, t1, t2
-            if abs(s1) > stop:
-                s1, s2 = math.copysign(stop, s1), 0.0
-        state[j, 0], state[j, 1], state[j, 2] = s0, s1, s2
-
-
-class PendulumBlock:
-    """Pendulums of one block as they move: forces and rates in, velocity increments out.
-
-    Over a step, the input is a parabola through its start, middle and end, for which the loop is solved exactly; a
-    deflection changes the input by its own small share, which is predicted. The results do not depend on how the steps
-    were split into calls.
-
-    Parameters
-    ----------
-    pendulums : sequence of Pendulum
-        p of them; at rest without deflection at first.
-    step : float
-        Length of a step, s; at most a quarter of the shortest natural period (8 kHz and more are meant).
-
-    Raises
-    ------
-    HilError
-        The step is too long.
-    """
-
-    def __init__(self, pendulums: Sequence[Pendulum], step: float) -> None:
-        fastest = max(p.frequency_hz for p in pendulums)
-        if not 0.0 < step * fastest <= 0.25:
-            raise HilError(
-                f"pendulum: a step of {step:g} s is too long for {fastest:g} Hz; take {0.25 / fastest:g} s or less"
-            )
-        self._step = step
-        self._parameters = np.stack([_parameters(p, step) for p in pendulums])
-        self._state = np.zeros((len(pendulums), 3))
-        self.saturated = np.zeros(len(pendulums))
-        """Steps that each pendulum has spent at its limit."""
-
-    @property
-    def deflection(self) -> FloatArray:
-        """phi of each pendulum, rad: (p,)."""
-        return self._state[:, 1].copy()
-
-    def sense(self, force: FloatArray, rate: FloatArray) -> FloatArray:
-        """Integrals of the outputs over the next n steps.
-
-        Parameters
-        ----------
-        force, rate : (2 n + 1, 3) float
-            Specific force at O, m/s^2, and rate, rad/s, in block axes, at the start, the middle and the end of each step;
-            the last row is the first one of the next call.
-
-        Returns
-        -------
-        (n, p) float
-            m/s, each along its own xi.
-
-        Raises
-        ------
-        HilError
-            The shapes do not fit, or an input is not finite.
-        """
-        if force.shape != rate.shape or force.shape[1:] != (3,) or len(force) % 2 == 0:
-            raise HilError(
-                f"pendulum: expected two (2 n + 1, 3) arrays of force and rate, got {force.shape}, {rate.shape}"
-            )
-        if not (np.isfinite(force).all() and np.isfinite(rate).all()):
-            raise HilError("pendulum: a force or a rate is not finite; mend the motion")
-        dvel = np.empty((len(force) // 2, len(self._state)))
-        _sense(
-            self._parameters,
-            self._state,
-            self._step,
-            np.ascontiguousarray(force, np.float64),
-            np.ascontiguousarray(rate, np.float64),
-            dvel,
-            self.saturated,
-        )
-        return dvel

@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from nav.errors import HilError
-from nav.instruments.pendulum import Pendulum, PendulumBlock, apparent_force, best_hinge
+from nav.instruments.pendulum import Pendulum, apparent_force, best_hinge
+from nav.instruments.rebalance import PendulumBlock
 
 AXES = tuple(map(tuple, Rotation.from_euler("zyx", [0.4, -1.1, 2.3]).as_matrix()))
 PLACED = replace(Pendulum(), hinge=(0.05, -0.02, 0.03), axes=AXES)
@@ -182,9 +183,10 @@ def test_full_dynamics_beside_an_integrator_of_high_order():
         block = PendulumBlock([p], duration / n)
         force, rate, _ = shaking(n, duration / n)
         errors.append(abs(block.sense(force, rate)[:, 0].sum() - exact[3]))
-        assert block.deflection[0] == pytest.approx(exact[1], rel=2e-3)
-    assert errors[0] < 2e-6  # of 0.1 m/s that came and went
-    assert errors[-1] < 0.15 * errors[-2] < 0.03 * errors[-3]
+        assert block.deflection[0] == pytest.approx(exact[1], rel=2e-5)
+    assert errors[0] < 1e-7 * abs(exact[3])
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.2)
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(4.0, abs=0.2)
 
 
 def test_chunks_do_not_matter():
