@@ -149,23 +149,16 @@ def scattered_block() -> Block:
 
 def _published() -> tuple[list[Row], list[Plot]]:
     rows, lines = [], []
-    level = np.array([0.0, 1.0, 0.0])
-    for key, name, motion, published, mean_square in (
-        ("turn", "coordinated turn, 0.1 rad/s", turn, 7.5, TURN_RATE**2),
-        *(
-            (
-                key,
-                f"vibration 0.4 mrad, {rate}",
-                vibration(pulsation, level),
-                published,
-                0.5 * (VIBRATION_RAD * pulsation) ** 2,
-            )
-            for key, rate, pulsation, published in (
-                ("vibration-300", "300 rad/s", PUBLISHED_PULSATION, 5.4),
-                ("vibration-50hz", "exactly 50 Hz", PULSATION, 5.9),
-            )
-        ),
+    cases: list[tuple[str, str, Motion, float, float]] = [
+        ("turn", "coordinated turn, 0.1 rad/s", turn, 7.5, TURN_RATE**2)
+    ]
+    for key, rate, pulsation, published in (
+        ("vibration-300", "300 rad/s", PUBLISHED_PULSATION, 5.4),
+        ("vibration-50hz", "exactly 50 Hz", PULSATION, 5.9),
     ):
+        shaking, mean_square = vibration(pulsation, np.array([0.0, 1.0, 0.0])), 0.5 * (VIBRATION_RAD * pulsation) ** 2
+        cases.append((key, f"vibration 0.4 mrad, {rate}", shaking, published, mean_square))
+    for key, name, motion, published, mean_square in cases:
         closed = 100.0 * LEVER_M * mean_square * DURATION_S**2 / 2.0
         time, raw, clean = errors(lever_block(), motion, 2000, dynamics=False)
         lines.append(Line(name, time[::20], 100.0 * np.abs(raw[::20, 0])))
@@ -298,16 +291,10 @@ def _layouts() -> tuple[list[Row], list[Plot]]:
     rows.append(at_most("centre-ideal", what, 1e3 * float(np.linalg.norm(found + hidden)), "mm", 1e-6))
     gain = size_error(moved(common, centre), gram) / size_error(common, gram)
     rows.append(at_most("centre-gain", "common: error at the best centre over that at the source's", gain, "1", 1.0))
-    aside = np.linspace(-0.2, 0.2, 81)
-    lines = [
-        Line(
-            f"along {name}",
-            1e3 * aside,
-            np.array([1e3 * size_error(moved(common, centre + d * axis), gram) for d in aside]),
-        )
-        for name, axis in zip("xyz", np.eye(3), strict=True)
-    ]
-    return rows, [Plot("centre", "Common layout: rms error by the place of O", "mm from the best", "mm/s^2", lines)]
+    aside = np.linspace(-0.1, 0.1, 81)
+    away = np.array([1e3 * size_error(moved(common, centre + d * SKEW), gram) for d in aside])
+    title = "Common layout: rms error in vibration by the place of O, along a skew line"
+    return rows, [Plot("centre", title, "mm from the best", "mm/s^2", [Line("", 1e3 * aside, away)])]
 
 
 def _turn_gram() -> FloatArray:

@@ -24,6 +24,9 @@ _RATIO = 8.0
 _LONGEST = 1.0e5
 """Longest correlation time of flicker, s: over longer times its deviation falls."""
 
+_BLOCK = 4096
+"""Steps whose random numbers are in memory at one time."""
+
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
@@ -110,6 +113,7 @@ class Noise:
     def increments(self, n: int) -> FloatArray:
         """Integrals of the noise over the next `n` steps: (n, channels), u s."""
         out = np.empty((n, len(self._state)))
-        normals = self._rng.standard_normal((n, *self._state.shape))
-        _run(normals, self._state, self._decay, self._drive, self._ramp, self._step, out)
+        for part in np.split(out, range(_BLOCK, n, _BLOCK)):
+            normals = self._rng.standard_normal((len(part), *self._state.shape))
+            _run(normals, self._state, self._decay, self._drive, self._ramp, self._step, part)
         return out
