@@ -81,8 +81,30 @@ class MotionConfig(_Model):
         return self
 
 
+class RotorConfig(_Model):
+    """Rotor of a dynamically tuned gyro, by the ratios that fix its motion (:mod:`nav.instruments.dtg`)."""
+
+    spin_hz: Positive = 228.0
+    inertia_ratio: Positive = 4.0 / 3.0
+    """Polar over equatorial inertia, J/A."""
+    stiffness_ratio: Positive = 10694.0
+    """Cross-axis stiffness over polar inertia, D/J, 1/s^2."""
+    damping_ratio: NotNegative = 9.0
+    """Damping over equatorial inertia, f/A, 1/s."""
+
+
+class FaultConfig(_Model):
+    """An instrument of the simulated head that fails."""
+
+    axis: Literal["g1x", "g1y", "g2y", "g2z", "ax", "ay", "az"]
+    kind: Literal["stuck", "noise", "jump", "built-in"]
+    at_s: NotNegative
+    size: Finite = 100.0
+    """Of a jump: rad/s or m/s^2. Of noise: times that of the grade (of the DTG grade where there is none)."""
+
+
 class HeadConfig(_Model):
-    """The simulated sensor head."""
+    """The sensor head: what the simulated one is made of, and what the core takes a real one for."""
 
     rate_hz: Annotated[float, Field(gt=0, le=10000)] = 1000.0
     layout: Literal["fd", "classic"] = "fd"
@@ -91,6 +113,15 @@ class HeadConfig(_Model):
     """Heading, pitch, roll of the head's axes relative to the body."""
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """Place of the head in the body, forward-right-down of the navigated point."""
+    instruments: Literal["ideal", "dtg"] = "ideal"
+    """``ideal``: true increments, nothing to compensate; ``dtg``: torquer increments and rotor angles of dynamically tuned gyros,
+    pendulum accelerometers with their size effect; the core takes both off."""
+    grade: Literal["none", "dtg", "tactical", "mems"] = "none"
+    """Errors of ``dtg`` instruments, drawn by the seed; and what the core's tests take for healthy."""
+    skew_deg: Finite = 0.0
+    """How far each gyro is turned about its spin axis: 0 is the orthogonal layout, 45 the skewed one."""
+    rotor: RotorConfig = RotorConfig()
+    faults: tuple[FaultConfig, ...] = ()
 
     @field_validator("rate_hz")
     @classmethod

@@ -1,0 +1,220 @@
+"""What the instruments of the simulated head give: ideal ones the true increments, real ones what physics makes of them.
+
+    motion at the nodes of steps of at most 1/8000 s -> errors of the gyros -> rotors -> torquer increments, rotor angles
+                                                    -> pendulums, each in its place -> errors of the accelerometers
+
+Errors and noise are drawn for a whole sample; rotors and pendulums move in the fine steps. The records depend on the scenario
+and its seed alone.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from hil.scenario import HeadConfig, RotorConfig, Scenario
+from hil.world.motion import Motion
+from nav.increments import FloatArray, IntArray
+from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerometers
+from nav.instruments.dtg import Rotor, move, step_map
+from nav.instruments.grades import GRADES
+from nav.instruments.gyro_errors import GyroErrors, Gyros
+from nav.instruments.layout import common_layout, moved
+from nav.instruments.noise import NoiseModel
+from nav.instruments.pendulum import Pendulum, PendulumBlock
+from nav.instruments.redundancy import AXES, Limits, layout
+from nav.rotation import dcm_from_quaternion, quaternion_from_euler
+
+INTERNAL_HZ = 8000.0
+"""Rotors and pendulums move in steps no longer than this."""
+BLOCK_OFFSET_M = 0.03
+"""How far the level pendulums' hinges of the simulated block lie out of its centre."""
+GYRO_RANGE = math.radians(180.0)
+"""The torquers saturate here, rad/s."""
+_CASE = ((0, 1, 2), (1, 0, 2))
+"""Input, other input and spin axis of a gyro's two channels, in the axes of its case."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """Samples of the head before they go on the wire.
+
+    Attributes
+    ----------
+    dtheta : (n, 4) float
+        g1x, g1y, g2y, g2z, rad.
+    dvel : (n, 3) float
+        m/s.
+    rotor : (n, 4) float or None
+        Rotor angles at the end of each sample, rad.
+    status : (n,) int
+        Status bits.
+    """
+
+    dtheta: FloatArray
+    dvel: FloatArray
+    rotor: FloatArray | None
+    status: IntArray
+
+
+def mounting(head: HeadConfig) -> FloatArray:
+    """C_bh (3, 3)."""
+    c: FloatArray = dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg)))
+    return c
+
+
+def rotor_of(config: RotorConfig) -> Rotor:
+    """The rotor that a scenario describes."""
+    return Rotor.from_ratios(
+        2.0 * math.pi * config.spin_hz, config.inertia_ratio, config.stiffness_ratio, config.damping_ratio
+    )
+
+
+def block_of(head: HeadConfig) -> tuple[Pendulum, ...]:
+    """The pendulums of the simulated block in their places about its centre, in head axes; none where they are ideal."""
+    return common_layout(Pendulum(), BLOCK_OFFSET_M) if head.instruments == "dtg" else ()
+
+
+def limits_of(head: HeadConfig) -> Limits:
+    """What healthy instruments of the scenario's grade do."""
+    if head.instruments == "ideal":
+        return Limits()
+    limit = Pendulum().limit
+    if head.grade == "none":
+        return Limits(gyro_range=GYRO_RANGE, accelerometer_range=limit)
+    grade = GRADES[head.grade]
+    return Limits(
+        grade.gyro_white,
+        grade.accelerometer_white,
+        5.0 * (grade.gyro_scale + grade.gyro_misalignment),
+        GYRO_RANGE,
+        limit,
+    )
+
+
+class IdealInstruments:
+    """True increments; both y axes are equal."""
+
+    def __init__(self, scenario: Scenario, step: float) -> None:
+        head = scenario.head
+        self._motion = Motion(scenario.motion, head.lever_arm_m)
+        self._c_hb, self._step = mounting(head).T, step
+        self._h = layout(math.radians(head.skew_deg))
+
+    def sense(self, first: int, count: int) -> Sensed:
+        """Samples `first` to `first` + `count`; the calls follow one another."""
+        dtheta, dvel = np.empty((count, 3)), np.empty((count, 3))
+        self._motion.increments(first, count, self._step, dtheta, dvel)
+        gyro = dtheta @ self._c_hb.T @ self._h.T
+        return Sensed(gyro, dvel @ self._c_hb.T, None, np.zeros(count, np.int64))
+
+
+class DtgInstruments:
+    """Two gyros and three pendulums by their physics, with the errors of a grade."""
+
+    def __init__(self, scenario: Scenario, step: float) -> None:
+        head = scenario.head
+        self._motion = Motion(scenario.motion)
+        self._c_hb, self._step = mounting(head).T, step
+        self._per = math.ceil(step * INTERNAL_HZ - 1e-9)
+        self._fine = step / self._per
+        h = layout(math.radians(head.skew_deg))
+        # Axes of each case: two input axes, spin axis.
+        self._cases = [np.array([h[2 * g], h[2 * g + 1], np.eye(3)[2 - 2 * g]]) for g in range(2)]
+        rotor = rotor_of(head.rotor)
+        self._gain = -1.0 / rotor.lag
+        self._table = step_map(rotor, self._fine)
+        seeds = np.random.SeedSequence(scenario.seed).spawn(4)
+        errors = _drawn(head, np.random.default_rng(seeds[0]))
+        self._gyros = [
+            Gyros(_part(errors[0], g), step, np.random.default_rng(seeds[1 + g])) for g in range(2)
+        ]
+        self._accelerometers = Accelerometers(errors[1], step, np.random.default_rng(seeds[3]))
+        arm = self._c_hb @ np.asarray(head.lever_arm_m)
+        self._block = PendulumBlock(moved(block_of(head), -arm), self._fine)
+        force, rate = np.empty((1, 3)), np.empty((1, 3))
+        self._motion.sampled(0, self._fine, force, rate)
+        still = (rate @ self._c_hb.T)[0]
+        self._rotors = [rotor.settled(tuple((case @ still)[:2])) for case in self._cases]
+
+    def sense(self, first: int, count: int) -> Sensed:
+        """Samples `first` to `first` + `count`; the calls follow one another."""
+        n = count * self._per
+        force, rate = np.empty((2 * n + 1, 3)), np.empty((2 * n + 1, 3))
+        self._motion.sampled(2 * first * self._per, 0.5 * self._fine, force, rate)
+        force, rate = force @ self._c_hb.T, rate @ self._c_hb.T
+        change = rate[2::2] - rate[:-1:2]
+        mean = (rate[:-1:2] + 4.0 * rate[1::2] + rate[2::2]) / 6.0
+        pushed = self._block.sense(force, rate).reshape(count, self._per, 3).sum(axis=1)
+        turned = self._step * mean.reshape(count, self._per, 3).mean(axis=1)
+        dtheta, angle = np.empty((count, 4)), np.empty((count, 4))
+        for g, (case, gyros) in enumerate(zip(self._cases, self._gyros, strict=True)):
+            true = turned @ case.T
+            wrong = (gyros.sense(true, pushed @ case.T) - true[:, :2]) / self._step
+            inputs = mean @ case[:2].T + np.repeat(wrong, self._per, axis=0)
+            tilt, swept = np.empty((n, 2)), np.empty((n, 2))
+            move(self._table, self._rotors[g], inputs, np.ascontiguousarray(change @ case[:2].T), tilt, swept)
+            columns = slice(2 * g, 2 * g + 2)
+            dtheta[:, columns] = self._gain * swept.reshape(count, self._per, 2).sum(axis=1)
+            angle[:, columns] = tilt[self._per - 1 :: self._per]
+        limit = GYRO_RANGE * self._step
+        saturated = np.abs(dtheta) > limit
+        status = np.where(saturated[:, :2].any(axis=1), 1 << 5, 0) | np.where(saturated[:, 2:].any(axis=1), 1 << 6, 0)
+        return Sensed(np.clip(dtheta, -limit, limit), self._accelerometers.sense(pushed), angle, status)
+
+
+class Faulty:
+    """Instruments that fail as the scenario says."""
+
+    def __init__(self, inner: IdealInstruments | DtgInstruments, scenario: Scenario, step: float) -> None:
+        self._inner, self._faults, self._step = inner, scenario.head.faults, step
+        self._rng = np.random.default_rng([scenario.seed, 1])
+        grade = GRADES["dtg" if scenario.head.grade == "none" else scenario.head.grade]
+        self._noise = np.repeat([grade.gyro_white, grade.accelerometer_white], [4, 3]) * math.sqrt(step)
+        self._stuck = np.full(7, np.nan)
+
+    def sense(self, first: int, count: int) -> Sensed:
+        """As those within."""
+        sensed = self._inner.sense(first, count)
+        time = self._step * np.arange(first + 1, first + count + 1)
+        for fault in self._faults:
+            axis = AXES.index(fault.axis)
+            values = sensed.dtheta[:, axis] if axis < 4 else sensed.dvel[:, axis - 4]
+            bad = time > fault.at_s + 1e-9
+            if not bad.any():
+                continue
+            if fault.kind == "stuck":
+                if math.isnan(self._stuck[axis]):
+                    self._stuck[axis] = values[bad][0]
+                values[bad] = self._stuck[axis]
+            elif fault.kind == "noise":
+                values[bad] += fault.size * self._noise[axis] * self._rng.standard_normal(int(bad.sum()))
+            elif fault.kind == "jump":
+                values[bad] += fault.size * self._step
+            else:
+                sensed.status[bad] |= 1 << (axis // 2 if axis < 4 else axis - 2)
+        return sensed
+
+
+def instruments(scenario: Scenario, step: float) -> IdealInstruments | DtgInstruments | Faulty:
+    """The instruments of a scenario, sampled every `step` s."""
+    inner = IdealInstruments(scenario, step) if scenario.head.instruments == "ideal" else DtgInstruments(scenario, step)
+    return Faulty(inner, scenario, step) if scenario.head.faults else inner
+
+
+def _drawn(head: HeadConfig, rng: np.random.Generator) -> tuple[GyroErrors, AccelerometerErrors]:
+    """Errors of the scenario's grade, for four gyro channels."""
+    if head.grade == "none":
+        return GyroErrors(channels=_CASE + _CASE), AccelerometerErrors()
+    return replace(GRADES[head.grade], gyro_channels=_CASE + _CASE).draw(rng)
+
+
+def _part(errors: GyroErrors, gyro: int) -> GyroErrors:
+    """Those of one gyro's two channels."""
+    columns = slice(2 * gyro, 2 * gyro + 2)
+    changed = {
+        field.name: tuple(getattr(errors, field.name)[columns])
+        for field in fields(errors)
+        if isinstance(getattr(errors, field.name), tuple) and len(getattr(errors, field.name)) == 4
+    }
+    return replace(errors, **changed)
