@@ -10,6 +10,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from importlib.resources import as_file, files
@@ -25,6 +26,7 @@ from hil.scenario import load
 from hil.world.head import SimulatedHead
 from hil.world.motion import Motion
 from nav.increments import FloatArray, ImuIncrements
+from nav.instruments.dtg_compensation import LagCompensator
 from nav.mechanization import geographic
 from nav.navigator import Navigator, Settings
 from nav.rotation import euler_angles
@@ -49,6 +51,7 @@ def measure(say: Callable[[str], None]) -> list[Row]:
     return [
         *_simulation(head),
         *_driver(slow, batch),
+        *_compensation(slow, batch),
         *_codec(batch),
         *_strapdown(),
         *_navigation(slow, batch),
@@ -102,6 +105,18 @@ def _driver(slow: Any, batch: Any) -> list[Row]:
 def _decode(driver: DtgHead, pieces: list[Any]) -> None:
     for piece in pieces:
         driver.decode(piece)
+
+
+def _compensation(slow: Any, batch: Any) -> list[Row]:
+    driver = DtgHead()
+    driver.decode(slow)
+    head = driver.decode(batch)
+    rows, out = [], np.empty((len(head), 4))
+    for name, what, angle in (("wire", "rotor angles on the wire", 0.0), ("cubic", "increments alone", np.nan)):
+        compensator, sent = LagCompensator(), replace(head, rotor=np.full_like(head.rotor, angle))
+        ns = _median_ns(partial(compensator.compensate, sent, out), len(head))
+        rows.append(_row(f"lag-{name}", f"lag compensation of both gyros, batch: {what}", ns))
+    return rows
 
 
 def _codec(batch: Any) -> list[Row]:

@@ -5,6 +5,7 @@ two axes. The mount is a damped spring, the same about all axes; it turns the an
 """
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,19 +51,18 @@ def rates(kind: str, pulsation: FloatArray, amplitude: ArrayLike) -> ComplexArra
     return out
 
 
-def roll_rows(taken_for: Rotor) -> list[Row]:
-    """Drift on the source's roll, by a compensation that is right, and by one that takes the gyros for `taken_for`."""
+def roll_rows(wrong: Mapping[str, tuple[str, Rotor]]) -> list[Row]:
+    """Drift on the source's roll: raw, compensated, and by compensations that take the gyros for something else."""
     amplitude, pulsation = math.radians(ROLL_DEG), np.array([ROLL])
     signal, rows = Rocking(amplitude, ROLL), []
-    for key, rotor in (("", HEAD), ("-lag-error", taken_for)):
+    for key, (words, rotor) in {"": ("", HEAD), **wrong}.items():
         edges, found = outputs(HEAD, signal, 60.0, rotor)
-        for form in FORMS if not key else FORMS[1:]:
+        for form in FORMS[1:] if key else FORMS:
             ours = drift_deg_h(signal, ROLL, edges, found[form])
             answer = response(HEAD, pulsation, form, rotor)
             reference = float(rectified_deg_h(answer, rates("rocking", pulsation, amplitude), pulsation)[0])
-            wrong = ", lag wrong by 2 %" if key else ""
-            what = f"roll of 10 deg at 8 rad/s, {WORDS[form]}{wrong}: drift (reference: closed form)"
-            name = f"roll-drift-{form}{key}"
+            what = ", ".join(filter(None, ("roll of 10 deg at 8 rad/s", WORDS[form], words)))
+            what, name = f"{what}: drift (reference: closed form)", "-".join(filter(None, ("roll-drift", form, key)))
             if form == "raw" or key:
                 rows.append(near(name, what, ours, "deg/h", 5e-3 * reference, reference=reference))
             else:
