@@ -1,9 +1,14 @@
 """The instruments: what the core takes off, and what the simulated head is made of."""
 
+from collections.abc import Iterator
+from functools import partial
+
 import numpy as np
 
 from hil.bench.timing import Row, Sizes, Work, rows_in_turns
+from nav.increments import HeadIncrements
 from nav.instruments.accelerometer_errors import Accelerometers
+from nav.instruments.dtg_compensation import LagCompensator
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import Gyros
 from nav.instruments.layout import ideal_layout
@@ -24,6 +29,7 @@ def rows(sizes: Sizes) -> list[Row]:
     force, rate = rng.normal(0.0, 1.0, (2, 2 * n + 1, 3))
     gyros, forces = Gyros(gyro_errors, step, rng), Accelerometers(force_errors, step, rng)
     works = [
+        *_lag(n, rng),
         Work(
             "size-effect",
             "size effect of three pendulums, compensated",
@@ -35,3 +41,12 @@ def rows(sizes: Sizes) -> list[Row]:
         Work("force-errors", "errors of three accelerometers, DTG head", lambda: forces.sense(dvel), n),
     ]
     return rows_in_turns(works, sizes.repeats)
+
+
+def _lag(n: int, rng: np.random.Generator) -> Iterator[Work]:
+    for name, what, angle in (("wire", "rotor angles on the wire", 0.0), ("cubic", "increments alone", np.nan)):
+        head, compensator, out = HeadIncrements.empty(n), LagCompensator(), np.empty((n, 4))
+        head.step[:], head.sequence[:] = 1e-3, np.arange(n)
+        head.dtheta[:], head.rotor[:] = rng.normal(0.0, 1e-3, (n, 4)), angle
+        run = partial(compensator.compensate, head, out)
+        yield Work(f"lag-{name}", f"lag compensation of both gyros, batch: {what}", run, n)

@@ -20,7 +20,6 @@ from nav.instruments.dtg import Rotor, move, step_map
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import GyroErrors, Gyros
 from nav.instruments.layout import common_layout, moved
-from nav.instruments.noise import NoiseModel
 from nav.instruments.pendulum import Pendulum, PendulumBlock
 from nav.instruments.redundancy import AXES, Limits, layout
 from nav.rotation import dcm_from_quaternion, quaternion_from_euler
@@ -126,9 +125,7 @@ class DtgInstruments:
         self._table = step_map(rotor, self._fine)
         seeds = np.random.SeedSequence(scenario.seed).spawn(4)
         errors = _drawn(head, np.random.default_rng(seeds[0]))
-        self._gyros = [
-            Gyros(_part(errors[0], g), step, np.random.default_rng(seeds[1 + g])) for g in range(2)
-        ]
+        self._gyros = [Gyros(_part(errors[0], g), step, np.random.default_rng(seeds[1 + g])) for g in range(2)]
         self._accelerometers = Accelerometers(errors[1], step, np.random.default_rng(seeds[3]))
         arm = self._c_hb @ np.asarray(head.lever_arm_m)
         self._block = PendulumBlock(moved(block_of(head), -arm), self._fine)
