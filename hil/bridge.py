@@ -31,13 +31,13 @@ from hil.scenario import Scenario
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
+from hil.world.instruments import head_model
 from hil.world.truth import TruthKeeper
 from nav.errors import HilError
 from nav.gaps import GapPolicy
 from nav.increments import HeadIncrements, ImuIncrements, IntArray
 from nav.instruments.head import HeadCombiner
 from nav.navigator import Navigator, Settings
-from nav.rotation import dcm_from_quaternion, quaternion_from_euler
 from nav.state import HOST_FIELDS, NAV_STATE
 
 BATCH = 1024
@@ -126,8 +126,7 @@ class Loop:
         self.navigator = Navigator(settings_of(scenario))
         self.finished = False
         """The scenario's duration is over."""
-        head = scenario.head
-        self._combiner = HeadCombiner(dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))))
+        self._combiner = HeadCombiner(head_model(scenario.head))
         self._outlets = outlets
         self._live = order.paced and order.file is None
         self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
@@ -184,7 +183,7 @@ class Loop:
             self._truth = self._own_truth
         if self._from_truth and not self._begin(raw):
             return
-        imu = self._combiner.combine(raw) if isinstance(raw, HeadIncrements) else raw
+        imu = self._combine(raw) if isinstance(raw, HeadIncrements) else raw
         rows = self.navigator.process(imu)
         rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
         self._arrival_ns = int(arrivals[-1])
@@ -195,6 +194,13 @@ class Loop:
             stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
         if len(rows) != len(imu):
             stats["interpolated"] += len(rows) - len(imu)
+
+    def _combine(self, raw: HeadIncrements) -> ImuIncrements:
+        combiner = self._combiner
+        imu = combiner.combine(raw)
+        for note in combiner.notes():
+            self.navigator.tell(note.time, "error" if note.bad else "notice", note.text)
+        return imu
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
         """Up to the scenario's duration: the device time covered so far, all lives of the device together."""
@@ -235,6 +241,7 @@ class Loop:
             self._publish(rows)
             self._outlets.stats["silences"] += 1
         elif event == REALIGN:
+            self._combiner.renew()
             self.navigator.realign(self._last_time(), "ordered")
 
     def ordered_event(self) -> int:

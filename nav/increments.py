@@ -114,6 +114,8 @@ class HeadIncrements:
     status : (n,) int
         What the head says of itself: bit 0 fault of gyro 1, 1 of gyro 2, 2..4 of the x, y, z accelerometer; others as its
         driver documents.
+    spin : (n, 2) float
+        Rotor speeds of both gyros as last said, Hz; NaN before.
     """
 
     time: FloatArray
@@ -124,6 +126,7 @@ class HeadIncrements:
     validity: IntArray
     sequence: IntArray
     status: IntArray
+    spin: FloatArray
 
     def __len__(self) -> int:
         return len(self.time)
@@ -139,6 +142,7 @@ class HeadIncrements:
             self.validity[start:stop],
             self.sequence[start:stop],
             self.status[start:stop],
+            self.spin[start:stop],
         )
 
     @staticmethod
@@ -153,4 +157,5 @@ class HeadIncrements:
             np.zeros(n, np.int64),
             np.zeros(n, np.int64),
             np.zeros(n, np.int64),
+            np.full((n, 2), np.nan),
         )

@@ -136,7 +136,7 @@ class Navigator:
         self._start_core()
         self._sums[:] = 0.0
         self._progress = 1.0
-        self._say(time, "info", "navigating from a given start")
+        self.tell(time, "info", "navigating from a given start")
         self.mode = Mode.NAVIGATE
 
     def realign(self, time: float, reason: str) -> None:
@@ -149,7 +149,7 @@ class Navigator:
             self._move(-1.0)
         lat, lon, height = self._state[:3]
         self._state = _solution(lat, lon, height, np.zeros(3), np.zeros(4))
-        self._say(time, "notice", f"aligning: {reason}")
+        self.tell(time, "notice", f"aligning: {reason}")
 
     def silent(self) -> StateArray:
         """The sensor has fallen silent: one row that repeats the last state and says so."""
@@ -158,7 +158,7 @@ class Navigator:
             self.mode = Mode.DEGRADED
         row = self._rows[:1]
         row["mode"], row["health"] = self.mode, self.health
-        self._say(float(row["time"][0]), "error", "no samples: the sensor is silent")
+        self.tell(float(row["time"][0]), "error", "no samples: the sensor is silent")
         return row
 
     def process(self, imu: ImuIncrements) -> StateArray:
@@ -182,7 +182,7 @@ class Navigator:
             self.realign(float(imu.time[0]), f"stand still for {self.settings.align_s:g} s")
         if self.health & Health.SILENT:
             self.health &= ~Health.SILENT
-            self._say(float(imu.time[0]), "notice", "samples arrive again")
+            self.tell(float(imu.time[0]), "notice", "samples arrive again")
             if not (gaps and gaps[0].realign):
                 self._trust(float(imu.time[0]))
         start = 0
@@ -275,7 +275,7 @@ class Navigator:
         self._start_core()
         self.mode = Mode.NAVIGATE
         heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(result.q_nb))
-        self._say(
+        self.tell(
             time,
             "info",
             f"aligned in {mean.time_s:.1f} s: heading {heading:.3f} pitch {pitch:.3f} roll {roll:.3f} deg, "
@@ -304,7 +304,7 @@ class Navigator:
         )
         self._state[:] = self._core.solution
         if done < n:
-            self._say(
+            self.tell(
                 float(imu.time[start + done]),
                 "notice",
                 f"the {before} mechanization is singular at the pole: {self._core.mechanization} goes on",
@@ -320,7 +320,7 @@ class Navigator:
 
     def _flag(self, time: float, flagged: int) -> None:
         if flagged & ~self._flagged & Validity.SENSOR:
-            self._say(time, "error", "the sensor flags its own samples: see its built-in test")
+            self.tell(time, "error", "the sensor flags its own samples: see its built-in test")
         self._flagged = flagged
         self.health &= ~(Health.SENSOR | Health.SPARE)
         self.health |= Health.SENSOR if flagged & Validity.SENSOR else Health.GOOD
@@ -344,7 +344,7 @@ class Navigator:
             self.realign(gap.time, what)
         elif gap.length_s > self.settings.gaps.interpolate_s:
             self.health |= Health.BRIDGED
-            self._say(gap.time, "warning", f"{what}: bridged, attitude and velocity are no longer exact")
+            self.tell(gap.time, "warning", f"{what}: bridged, attitude and velocity are no longer exact")
             self._trust(gap.time)
 
     def _trust(self, time: float) -> None:
@@ -352,14 +352,14 @@ class Navigator:
             mode = Mode.DEGRADED if self.health & DISTRUST else Mode.NAVIGATE
             if mode != self.mode:
                 self.mode = mode
-                self._say(time, "warning" if mode == Mode.DEGRADED else "info", f"mode {mode.name.lower()}")
+                self.tell(time, "warning" if mode == Mode.DEGRADED else "info", f"mode {mode.name.lower()}")
 
     def _complain(self, time: float, health: Health, text: str) -> None:
         if not self.health & health:
             self.health |= health
-            self._say(time, "warning", text)
+            self.tell(time, "warning", text)
 
-    def _say(self, time: float, severity: Severity, text: str) -> None:
+    def tell(self, time: float, severity: Severity, text: str) -> None:
         self._events.append(Event(time, severity, text))
 
     def _fill_constant(self, part: StateArray) -> None:

@@ -25,6 +25,8 @@ FAULTS = 0x03FF
 """Status bits that make a sample suspect."""
 ROTOR_VALID = 0x8000
 """Status bit: the rotor angles are there."""
+# What the slow frames have said, a row for each frame: sample period (us), status bits of the built-in test, rotor speeds (Hz).
+_PERIOD, _BIT, _SPIN, _SAID = 0, 1, slice(2, 4), 4
 _BUILT_IN = ("bit_g1", "bit_g2", "bit_ax", "bit_ay", "bit_az")
 """Signals of HEAD_BIT, in the order of the status bits that say the same."""
 WINDOW = 64
@@ -42,7 +44,7 @@ _FD_SIGNALS = (
     *("dvel_x", "dvel_y", "dvel_z"),
 )
 # State of the tracker.
-_STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN, _PERIOD_US = range(7)
+_STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN = range(6)
 # Outcomes of the tracker.
 _SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS = range(7)
 
@@ -61,7 +63,7 @@ def _signed32(value: int) -> int:
 def _track(
     values: FloatArray,
     good: NDArray[np.bool_],
-    periods: IntArray,
+    said: FloatArray,
     state: IntArray,
     outcome: IntArray,
     time: FloatArray,
@@ -82,7 +84,7 @@ def _track(
         counter, us = int(values[k, _COUNTER]), int(values[k, _TIME])
         delta = _signed32(counter - state[_LAST_COUNTER])
         elapsed = _signed32(us - state[_LAST_US])
-        period = periods[k]
+        period = said[k, _PERIOD]
         if state[_STARTED] == 0:
             state[_STARTED] = 1
             state[_SEQUENCE], state[_TIME_US] = counter, us
@@ -179,8 +181,9 @@ class DtgHead:
         self.period_s: float | None = None
         self.world_id = 0
         self._identity: dict[str, object] = {}
-        self._built_in = 0
-        self._state = np.zeros(7, np.int64)
+        self._now = np.array([0.0, 0.0, np.nan, np.nan])
+        """What the slow frames have said so far."""
+        self._state = np.zeros(6, np.int64)
         self._outcome = np.zeros(7, np.int64)
         self._partial = np.zeros((6, 8), np.uint8)
         self._partial_state = np.array([-1, 0], np.int64)
@@ -194,7 +197,7 @@ class DtgHead:
         self._values = np.zeros((n, _COLUMNS))
         self._good = np.zeros(n, np.bool_)
         self._rows = np.zeros(n, np.int64)
-        self._periods = np.zeros(n, np.int64)
+        self._said = np.zeros((n, _SAID))
 
     def identity(self) -> dict[str, object]:
         """Serial, hardware, sample period, temperatures, rotor speeds, supply and built-in test, as last heard."""
@@ -212,31 +215,31 @@ class DtgHead:
         self.counters.frames += n
         ids = batch["can_id"]
         is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
-        periods = self._periods[:n]
-        periods[:] = self._state[_PERIOD_US]
+        said = self._said[:n]
+        said[:] = self._now
         if is_sample.all():
             self._data[:n] = batch["data"]
-            return self._samples(n, batch["time_ns"], periods)
-        self._others(batch, np.flatnonzero(~is_sample), periods)
+            return self._samples(n, batch["time_ns"], said)
+        self._others(batch, np.flatnonzero(~is_sample), said)
         chosen = batch[is_sample]
         if len(chosen):
             self._data[: len(chosen)] = chosen["data"]
-            return self._samples(len(chosen), chosen["time_ns"], periods[is_sample])
-        return self._classic_samples(batch, periods)
+            return self._samples(len(chosen), chosen["time_ns"], said[is_sample])
+        return self._classic_samples(batch, said)
 
-    def _samples(self, n: int, times: IntArray, periods: IntArray) -> HeadIncrements:
+    def _samples(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
         data = self._data[:n]
         self._protection["HEAD_SAMPLE"].check(data, self._good[:n])
         self._sample.decode(data, self._raw[:n])
         self._values[:n] = self._raw[:n, self._columns]
-        return self._accept(n, times, periods)
+        return self._accept(n, times, said)
 
-    def _accept(self, n: int, times: IntArray, periods: IntArray) -> HeadIncrements:
+    def _accept(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
         batch, values = self._batch, self._values[:n]
         count = _track(
             values,
             self._good[:n],
-            periods,
+            said,
             self._state,
             self._outcome,
             batch.time,
@@ -254,10 +257,10 @@ class DtgHead:
         invalid = (kept[:, _STATUS].astype(np.int64) & ROTOR_VALID) == 0
         if invalid.any():
             result.rotor[invalid] = np.nan
-        result.status[:] = kept[:, _STATUS]
-        if self._built_in:
-            result.status[:] |= self._built_in
-            result.validity[:] |= Validity.SENSOR.value
+        said = said[rows]
+        result.spin[:] = said[:, _SPIN]
+        result.status[:] = kept[:, _STATUS].astype(np.int64) | said[:, _BIT].astype(np.int64)
+        result.validity[said[:, _BIT] != 0.0] |= Validity.SENSOR.value
         self._arrivals = times[rows]
         counters, outcome = self.counters, self._outcome
         counters.samples, counters.lost, counters.late = (
@@ -272,8 +275,8 @@ class DtgHead:
         outcome[_DUPLICATED] = outcome[_CRC] = outcome[_VERSION] = 0
         return result
 
-    def _others(self, batch: FrameArray, chosen: IntArray, periods: IntArray) -> None:
-        """Count what is not a sample and read the slow frames; the period that one says holds for what follows it."""
+    def _others(self, batch: FrameArray, chosen: IntArray, said: FloatArray) -> None:
+        """Count what is not a sample and read the slow frames; what one says holds for what follows it."""
         for k in chosen:
             row = batch[k]
             can_id, length = int(row["can_id"]), int(row["length"])
@@ -282,7 +285,7 @@ class DtgHead:
             codec = self._slow.get(can_id)
             if codec is not None and length == 8:
                 self._read_slow(codec, row["data"][None, :8])
-                periods[k:] = self._state[_PERIOD_US]
+                said[k:] = self._now
             elif can_id & ERR or can_id & RTR or can_id & EFF or not self._is_ours(can_id):
                 self.counters.foreign += 1
             else:
@@ -301,13 +304,15 @@ class DtgHead:
             return
         if codec.name == "HEAD_CONFIG":
             self.world_id = int(said["world_id"])
-            self._state[_PERIOD_US] = int(said["sample_period"])
+            self._now[_PERIOD] = said["sample_period"]
             self.period_s = said["sample_period"] * 1e-6
         if codec.name == "HEAD_BIT":
-            self._built_in = sum(1 << k for k, name in enumerate(_BUILT_IN) if said[name])
+            self._now[_BIT] = sum(1 << k for k, name in enumerate(_BUILT_IN) if said[name])
+        if codec.name == "HEAD_ROTOR":
+            self._now[_SPIN] = said["rotor_speed_g1"], said["rotor_speed_g2"]
         self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
 
-    def _classic_samples(self, batch: FrameArray, periods: IntArray) -> HeadIncrements:
+    def _classic_samples(self, batch: FrameArray, said: FloatArray) -> HeadIncrements:
         ids, eight = batch["can_id"], batch["length"] == 8
         kind = np.full(len(batch), -1, np.int64)
         data = np.ascontiguousarray(batch["data"][:, :8])
@@ -332,4 +337,4 @@ class DtgHead:
             else:
                 values[:, column] = part.get(name, 0.0)
         self._good[:n] = True
-        return self._accept(n, batch["time_ns"][last[:n]], periods[last[:n]])
+        return self._accept(n, batch["time_ns"][last[:n]], said[last[:n]])

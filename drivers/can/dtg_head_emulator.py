@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from drivers.can.codec import load_database
-from drivers.can.dtg_head import CLASSIC, PROTOCOL, SLOW, head_database_text
+from drivers.can.dtg_head import CLASSIC, PROTOCOL, ROTOR_VALID, SLOW, head_database_text
 from drivers.can.frames import BRS, FDF, FrameArray, frames
 from drivers.can.integrity import Protection, protection
 from nav.errors import HilError
@@ -38,6 +38,11 @@ def _quantise(values: FloatArray, lsb: float, bits: int, residue: FloatArray, ou
     return -1
 
 
+def _rounded(angle: FloatArray) -> IntArray:
+    """Rotor angles in LSB, held at the ends of the range: a rotor on its stops."""
+    return np.clip(np.rint(angle / ANGLE_LSB), -(2.0**31), 2.0**31 - 1.0).astype(np.int64)
+
+
 class HeadEncoder:
     """Frames of one head; remembers counters and residues.
 
@@ -49,6 +54,8 @@ class HeadEncoder:
         Nominal sample period that the head announces.
     serial, world_id, hardware : int
         What HEAD_IDENTITY and HEAD_CONFIG say.
+    rotor_hz : float
+        Rotor speeds that HEAD_ROTOR says.
     """
 
     def __init__(
@@ -59,6 +66,7 @@ class HeadEncoder:
         serial: int = 1,
         world_id: int = 0,
         hardware: int = SIMULATED,
+        rotor_hz: float = 228.0,
     ) -> None:
         if not 0 < period_us < 1 << 16:
             raise HilError(f"the head's sample period must be 1..65535 us, not {period_us}")
@@ -77,7 +85,7 @@ class HeadEncoder:
             "HEAD_IDENTITY": {"serial": serial, "protocol": PROTOCOL, "hardware": hardware},
             "HEAD_CONFIG": {"world_id": world_id, "sample_period": period_us},
             "HEAD_TEMPERATURE": {"temperature_g1": 40.0, "temperature_g2": 40.0, "temperature_acc": 35.0},
-            "HEAD_ROTOR": {"rotor_speed_g1": 228.0, "rotor_speed_g2": 228.0, "supply": 27.0},
+            "HEAD_ROTOR": {"rotor_speed_g1": rotor_hz, "rotor_speed_g2": rotor_hz, "supply": 27.0},
             "HEAD_BIT": {},
         }
         self._slow_count = 0
@@ -85,7 +93,13 @@ class HeadEncoder:
         self._velocity_residue = np.zeros(3)
 
     def samples(
-        self, counter: IntArray, time_us: IntArray, dtheta: FloatArray, dvel: FloatArray, status: int = 0
+        self,
+        counter: IntArray,
+        time_us: IntArray,
+        dtheta: FloatArray,
+        dvel: FloatArray,
+        status: IntArray | int = 0,
+        rotor: FloatArray | None = None,
     ) -> FrameArray:
         """Frames of n samples, in the order in which a head sends them.
 
@@ -97,8 +111,10 @@ class HeadEncoder:
             Increments of g1x, g1y, g2y, g2z, rad.
         dvel : (n, 3) float
             Increments of x, y, z, m/s.
-        status : int
-            Status bits.
+        status : (n,) int
+            Status bits; whether rotor angles are there is added.
+        rotor : (n, 4) float, optional
+            Rotor angles of the same axes at the end of each sample, rad; not carried by the classic layout.
 
         Raises
         ------
@@ -116,10 +132,12 @@ class HeadEncoder:
             "sample_counter": counter & 0xFFFFFFFF,
             "device_time": time_us & 0xFFFFFFFF,
             "protocol": PROTOCOL,
-            "status": status,
+            "status": status | ROTOR_VALID if rotor is not None and self._layout == "fd" else status,
         }
         for i, axis in enumerate(("g1x", "g1y", "g2y", "g2z")):
             raw[f"dtheta_{axis}"] = angles[:, i]
+            if rotor is not None:
+                raw[f"rotor_{axis}"] = _rounded(rotor[:, i])
         for i, axis in enumerate("xyz"):
             raw[f"dvel_{axis}"] = velocities[:, i]
             raw[f"dvel_{axis}_lo"] = velocities[:, i] & 0xFFFF

@@ -14,7 +14,7 @@ from nav.increments import FloatArray
 from nav.instruments.dtg import HEAD, SOURCE, Rotor, respond
 from nav.instruments.dtg_response import Response, compensated_response, noise_gain, noise_spectrum, raw_response
 from nav.instruments.dtg_stability import Kind, growth, stability
-from nav.rotation import euler_angles
+from nav.rotation import euler_from_quaternion
 
 TURN = 2.0 * math.pi
 ROLL_DEG = 10.0
@@ -201,13 +201,13 @@ def _attitude() -> tuple[list[Row], list[Plot]]:
             rate = source_roll(pulsation)[0]
             q = method(name).integrate_rates(level, np.full(len(rate) - 1, STEP_S), rate)
             what = f"{name}, raw rates as the source: amplitude of the roll at {pulsation:g} rad/s"
-            ours = amplitude_deg(euler_angles(q)[:, 2])
+            ours = amplitude_deg(euler_from_quaternion(q)[:, 2])
             rows.append(near(f"roll-{name}-raw-{pulsation:g}", what, ours, "deg", 0.05, published=published))
         for form in COMPENSATED:
             worst = 0.0
             for pulsation, (edges, axes) in found.items():
                 q = method(name).integrate(swings[pulsation].attitude(edges[:1])[0], np.diff(edges), body(axes[form]))
-                roll = euler_angles(q)[:, 2]
+                roll = euler_from_quaternion(q)[:, 2]
                 worst = max(worst, abs(amplitude_deg(roll) / ROLL_DEG - 1.0))
             what = f"{name}, {WORDS[form]}: largest error of the amplitude, 0.5 to 8 rad/s"
             rows.append(at_most(f"roll-{name}-{form}", what, 100.0 * worst, "%", 0.01))
@@ -216,7 +216,7 @@ def _attitude() -> tuple[list[Row], list[Plot]]:
     start, time = swings[8.0].attitude(edges[:1])[0], edges[1:][part]
     for form in FORMS:
         q = method(METHODS[1]).integrate(start, np.diff(edges)[part], body(axes[form])[part])
-        lines.append(Line(WORDS[form], time, np.degrees(euler_angles(q)[:, 2])))
+        lines.append(Line(WORDS[form], time, np.degrees(euler_from_quaternion(q)[:, 2])))
     return rows, [Plot("roll", "Roll of 10 deg at 8 rad/s by the Euler vector", "s", "deg", lines)]
 
 

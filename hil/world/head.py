@@ -19,29 +19,29 @@ from hil.pacing import Pacer
 from hil.scenario import Scenario
 from hil.stats import Stats
 from hil.warmup import warm_head
-from hil.world.motion import Motion
+from hil.world.instruments import instruments
 from nav.errors import HilError
-from nav.rotation import dcm_from_quaternion, quaternion_from_euler
 
 CHUNK_S = 0.1
 """Motion is computed this far ahead."""
 
 
 class SimulatedHead:
-    """Frames of the head of a scenario.
-
-    The increments of both y axes are equal: the instruments are ideal.
-    """
+    """Frames of the head of a scenario."""
 
     def __init__(self, scenario: Scenario) -> None:
         head = scenario.head
         self.period_us = round(1e6 / head.rate_hz)
         self.step = self.period_us * 1e-6
         self.frames_per_sample = 1 if head.layout == "fd" else 6
-        self._motion = Motion(scenario.motion, head.lever_arm_m)
-        self._c_hb = dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg))).T
+        self._instruments = instruments(scenario, self.step)
         self._encoder = HeadEncoder(
-            head.layout, self.period_us, serial=head.serial, world_id=scenario.world_id(), hardware=SIMULATED
+            head.layout,
+            self.period_us,
+            serial=head.serial,
+            world_id=scenario.world_id(),
+            hardware=SIMULATED,
+            rotor_hz=head.rotor.spin_hz,
         )
         self._slow_every = max(1, round(1.0 / self.step))
         self._chunk = max(1, min(self._slow_every, round(CHUNK_S / self.step)))
@@ -57,12 +57,10 @@ class SimulatedHead:
             first += count
 
     def _samples(self, first: int, count: int) -> FrameArray:
-        dtheta, dvel = np.empty((count, 3)), np.empty((count, 3))
-        self._motion.increments(first, count, self.step, dtheta, dvel)
-        head_dtheta = dtheta @ self._c_hb.T
+        sensed = self._instruments.sense(first, count)
         counter = np.arange(first, first + count)
         return self._encoder.samples(
-            counter, (counter + 1) * self.period_us, head_dtheta[:, (0, 1, 1, 2)], dvel @ self._c_hb.T
+            counter, (counter + 1) * self.period_us, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor
         )
 
 

@@ -9,6 +9,7 @@ and its seed alone.
 
 import math
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -19,8 +20,10 @@ from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerome
 from nav.instruments.dtg import Rotor, move, step_map
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import GyroErrors, Gyros
+from nav.instruments.head import HeadModel
 from nav.instruments.layout import common_layout, moved
-from nav.instruments.pendulum import Pendulum, PendulumBlock
+from nav.instruments.pendulum import Pendulum
+from nav.instruments.rebalance import PendulumBlock
 from nav.instruments.redundancy import AXES, Limits, layout
 from nav.rotation import dcm_from_quaternion, quaternion_from_euler
 
@@ -72,6 +75,18 @@ def rotor_of(config: RotorConfig) -> Rotor:
 def block_of(head: HeadConfig) -> tuple[Pendulum, ...]:
     """The pendulums of the simulated block in their places about its centre, in head axes; none where they are ideal."""
     return common_layout(Pendulum(), BLOCK_OFFSET_M) if head.instruments == "dtg" else ()
+
+
+def head_model(head: HeadConfig) -> HeadModel:
+    """What the core takes the head of a scenario for."""
+    rotor = rotor_of(head.rotor)
+    return HeadModel(
+        mounting(head),
+        math.radians(head.skew_deg),
+        (rotor, rotor) if head.instruments == "dtg" else None,
+        block_of(head),
+        limits_of(head),
+    )
 
 
 def limits_of(head: HeadConfig) -> Limits:
@@ -156,7 +171,9 @@ class DtgInstruments:
             angle[:, columns] = tilt[self._per - 1 :: self._per]
         limit = GYRO_RANGE * self._step
         saturated = np.abs(dtheta) > limit
-        status = np.where(saturated[:, :2].any(axis=1), 1 << 5, 0) | np.where(saturated[:, 2:].any(axis=1), 1 << 6, 0)
+        status = np.zeros(count, np.int64)
+        for gyro in range(2):
+            status[saturated[:, 2 * gyro : 2 * gyro + 2].any(axis=1)] |= 1 << (5 + gyro)
         return Sensed(np.clip(dtheta, -limit, limit), self._accelerometers.sense(pushed), angle, status)
 
 
@@ -208,10 +225,9 @@ def _drawn(head: HeadConfig, rng: np.random.Generator) -> tuple[GyroErrors, Acce
 
 def _part(errors: GyroErrors, gyro: int) -> GyroErrors:
     """Those of one gyro's two channels."""
-    columns = slice(2 * gyro, 2 * gyro + 2)
-    changed = {
-        field.name: tuple(getattr(errors, field.name)[columns])
+    changed: dict[str, Any] = {
+        field.name: getattr(errors, field.name)[2 * gyro : 2 * gyro + 2]
         for field in fields(errors)
-        if isinstance(getattr(errors, field.name), tuple) and len(getattr(errors, field.name)) == 4
+        if isinstance(getattr(errors, field.name), tuple) and len(getattr(errors, field.name)) == len(errors.channels)
     }
     return replace(errors, **changed)

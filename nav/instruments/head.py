@@ -112,7 +112,6 @@ class HeadCombiner:
             *(limits.gyro_range, limits.accelerometer_range),
         )
         self._notes: list[Note] = []
-        self._status, self._slow_rotors = 0, 0
         self.faults = np.zeros(7, np.int64)
         self._room(256)
         self.renew()
@@ -147,9 +146,13 @@ class HeadCombiner:
         else:
             self._lag.compensate(head, gyro)
         dvel[:], validity[:] = head.dvel, head.validity
+        said = self._said(head)
         start = 0
         while start < n:
-            stop = self._until_status_changes(head, start)
+            if said[start] != self._status:
+                self._take_status(float(head.time[start]), int(said[start]))
+            changes = np.flatnonzero(said[start:] != self._status)
+            stop = start + int(changes[0]) if len(changes) else n
             before = self.faults.copy()
             done = redundancy.examine(
                 self._memory,
@@ -175,32 +178,20 @@ class HeadCombiner:
         _turn(self._c_bh, dvel)
         return ImuIncrements(head.time, head.step, dtheta, dvel, validity, head.sequence)
 
-    def rotor_speeds(self, time: float, *speeds: float) -> None:
-        """What the head says of the speeds of G1 and G2, rad/s; a wrong one is a failed gyro."""
-        if self._rotors is None:
-            return
-        wrong = sum(
-            1 << k
-            for k, (rotor, speed) in enumerate(zip(self._rotors, speeds, strict=True))
-            if abs(speed / rotor.spin - 1.0) > SPEED_TOLERANCE
-        )
-        if wrong != self._slow_rotors:
-            self._slow_rotors = wrong
-            self._take_status(time, self._status)
-
-    def _until_status_changes(self, head: HeadIncrements, start: int) -> int:
-        """End of the samples from `start` on with one status; what it says is taken first."""
-        status = head.status[start:] & 0x1F
-        if status[0] != self._status:
-            self._take_status(float(head.time[start]), int(status[0]))
-        changes = np.flatnonzero(status != status[0])
-        return start + int(changes[0]) if len(changes) else len(head)
+    def _said(self, head: HeadIncrements) -> IntArray:
+        """Status bits of the instruments, and of the gyros whose rotor does not have its speed."""
+        status: IntArray = head.status & 0x1F
+        for gyro, rotor in enumerate(self._rotors or ()):
+            wrong = np.abs(head.spin[:, gyro] * (2.0 * math.pi / rotor.spin) - 1.0) > SPEED_TOLERANCE
+            if wrong.any():
+                status = status | np.where(wrong, 1 << gyro, 0)
+        return status
 
     def _take_status(self, time: float, status: int) -> None:
         before, self._status = self.faults.copy(), status
         self.faults &= ~Fault.BUILT_IN.value
         for bit, axes in enumerate(_STATUS_AXES):
-            if (status | self._slow_rotors) & 1 << bit:
+            if status & 1 << bit:
                 self.faults[list(axes)] |= Fault.BUILT_IN.value
         if (self.faults != before).any():
             self._tell(time, before)
