@@ -190,7 +190,7 @@ def _obey(command: str, control: Control) -> None:
 
 def _warm_up(station: Station) -> None:
     """Compile or load every kernel before the first message is due."""
-    _ = station.solution.euler, station.geoid(0.0, 0.0)
+    station.geoid(0.0, 0.0)
 
 
 def _tell(report: Connection, what: dict[str, Any]) -> None:
