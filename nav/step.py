@@ -32,6 +32,8 @@ MEMORY_PART = slice(_MEMORY, _STATE)
 STATE_PART = slice(_STATE, _SAMPLE)
 SOLUTION_PART = slice(_SOLUTION, CORE)
 
+PUSH = "intp(intp, f8, f8, f8, f8, f8, f8, f8)"
+"""Signature of `push`."""
 DONE, POLE, NOT_FINITE = 1, 0, -1
 """Answers of `push`."""
 

@@ -30,6 +30,7 @@ ATTITUDES = (
 """What there is, for messages and help."""
 
 
+_push: Any = kernels.push
 Answers = tuple[FloatArray, FloatArray, FloatArray]
 """Room for position, velocity and attitude."""
 
@@ -114,8 +115,7 @@ class Strapdown:
         young = self._window > 2 and not self._blocks
         self._lead: list[FloatArray] | None = [] if young else None
         self._origin = self._state.copy()
-        self.push: Callable[[float, float, float, float, float, float, float], int] = self._push_slowly
-        self._quicken()
+        self.push: Callable[[float, float, float, float, float, float, float], int] = self._push_first
 
     def hand_over(self, mechanization: str, azimuth: float = 0.0) -> None:
         """Go on in another mechanization, from the present solution and with the increments before.
@@ -265,18 +265,16 @@ class Strapdown:
         for array, value in zip(out, again, strict=True):
             array[0] = value[-1]
         self._lead = None
-        self._quicken()
 
-    def _quicken(self) -> None:
-        """Let `push` be the compiled one."""
-        if self._lead is None and self._stream is None and not self._blocks:
-            self.push = partial(_entry(), self._core.ctypes.data)
-
-    def _push_slowly(self, step: float, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> int:
+    def _push_first(self, step: float, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> int:
+        """Take a sample as `advance` does, until all that the compiled function needs is there."""
         if not np.isfinite(step + x + y + z + vx + vy + vz):
             return kernels.NOT_FINITE
         one = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 4))
         self.advance(np.array([step]), np.array([[x, y, z]]), np.array([[vx, vy, vz]]), np.zeros(3), *one)
+        if self._lead is None and self._stream is None and not self._blocks:
+            # The compiled function itself: numba's dispatcher costs as much as the step.
+            self.push = partial(_push.compile(kernels.PUSH), self._core.ctypes.data)
         return kernels.DONE
 
     def _room(self, n: int) -> None:
@@ -291,14 +289,6 @@ class Strapdown:
         before = np.concatenate([self._q[None], rows[:-1]])
         turns_between(before, rows, self._dq[:n])
         self._q = rows[-1].copy()
-
-
-def _entry() -> Any:
-    """The compiled `push` without numba's dispatcher, which costs as much as the step."""
-    kernel: Any = kernels.push
-    if not kernel.signatures:
-        kernel(np.zeros(kernels.CORE).ctypes.data, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    return next(iter(kernel.overloads.values())).entry_point
 
 
 def _method(attitude: str) -> attitudes.AttitudeMethod:

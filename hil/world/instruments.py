@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from hil.scenario import HeadConfig, RotorConfig, Scenario
 from hil.world.motion import Motion
 from nav.increments import FloatArray, IntArray
@@ -185,6 +186,7 @@ class Faulty:
         self._rng = np.random.default_rng([scenario.seed, 1])
         grade = GRADES["dtg" if scenario.head.grade == "none" else scenario.head.grade]
         self._noise = np.repeat([grade.gyro_white, grade.accelerometer_white], [4, 3]) * math.sqrt(step)
+        self._velocity_lsb = VELOCITY_LSB[scenario.head.layout]
         self._stuck = np.full(7, np.nan)
 
     def sense(self, first: int, count: int) -> Sensed:
@@ -198,8 +200,9 @@ class Faulty:
             if not bad.any():
                 continue
             if fault.kind == "stuck":
-                if math.isnan(self._stuck[axis]):
-                    self._stuck[axis] = values[bad][0]
+                if math.isnan(self._stuck[axis]):  # the head goes on sending the same number
+                    lsb = ANGLE_LSB if axis < 4 else self._velocity_lsb
+                    self._stuck[axis] = lsb * round(values[bad][0] / lsb)
                 values[bad] = self._stuck[axis]
             elif fault.kind == "noise":
                 values[bad] += fault.size * self._noise[axis] * self._rng.standard_normal(int(bad.sum()))

@@ -2,8 +2,8 @@
 
     lag of the gyros taken off -> tests, parity, combination of the four axes -> size effect -> body axes
 
-A failed axis is left out from the sample after the one that shows it. What the layout cannot spare is said, and the sample
-flagged: an attitude of what is left, zero about the axis that nobody measures, is better than none.
+A failed axis is left out from the sample after the one that shows it. What the layout cannot spare is said, and the samples
+are flagged: a noisy or saturated axis then goes on being used, a dead one counts as zero.
 """
 
 import math
@@ -207,8 +207,11 @@ class HeadCombiner:
         inverse = redundancy.combination(self._h, np.where(lost, 0.0, 1.0))
         bad = inverse is None or doubt or bool((self.faults[4:] & _LOST.value).any())
         self._flag = int(Validity.SENSOR) if bad else int(Validity.SPARE) if lost.any() else 0
-        # What is left, and nothing about the axis that nobody measures.
-        self._inverse = inverse if inverse is not None else np.linalg.pinv(np.where(lost[:, None], 0.0, self._h))
+        if inverse is None:  # better a bad measurement than none; a dead one is none
+            dead = (gyros & Fault.STUCK.value) != 0
+            self._inverse = np.linalg.pinv(np.where(dead[:, None], 0.0, self._h))
+        else:
+            self._inverse = inverse
         self._parity = np.zeros(4) if lost.any() else redundancy.parity_vector(self._h)
         self._doubt, self._spans = doubt, inverse is not None
 
