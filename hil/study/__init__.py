@@ -7,7 +7,11 @@ from typing import Any
 from hil.study.report import Study, write
 from nav.errors import HilError
 
-_MODULES = {"orientation": "hil.study.orientation", "navigation": "hil.study.navigation"}
+_MODULES = {
+    "orientation": "hil.study.orientation",
+    "navigation": "hil.study.navigation",
+    "pendulum": "hil.study.pendulum",
+}
 """Studies by name: modules with a function ``run() -> Study``."""
 
 
