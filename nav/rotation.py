@@ -63,20 +63,26 @@ def rotate(q: FloatArray, v: FloatArray, out: FloatArray) -> None:
     out[0], out[1], out[2] = x, y, z
 
 
+@inline_kernel
+def fill_dcm(q: FloatArray, out: FloatArray) -> None:
+    """Write the direction-cosine matrix C_ab of the unit quaternion q_ab into `out` (3, 3)."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    out[0, 0] = w * w + x * x - y * y - z * z
+    out[1, 1] = w * w - x * x + y * y - z * z
+    out[2, 2] = w * w - x * x - y * y + z * z
+    out[0, 1] = 2.0 * (x * y - w * z)
+    out[1, 0] = 2.0 * (x * y + w * z)
+    out[0, 2] = 2.0 * (x * z + w * y)
+    out[2, 0] = 2.0 * (x * z - w * y)
+    out[1, 2] = 2.0 * (y * z - w * x)
+    out[2, 1] = 2.0 * (y * z + w * x)
+
+
 @kernel
 def dcm_from_quaternion(q: FloatArray) -> FloatArray:
     """Direction-cosine matrix C_ab (3, 3) of the unit quaternion q_ab."""
     c = np.empty((3, 3))
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    c[0, 0] = w * w + x * x - y * y - z * z
-    c[1, 1] = w * w - x * x + y * y - z * z
-    c[2, 2] = w * w - x * x - y * y + z * z
-    c[0, 1] = 2.0 * (x * y - w * z)
-    c[1, 0] = 2.0 * (x * y + w * z)
-    c[0, 2] = 2.0 * (x * z + w * y)
-    c[2, 0] = 2.0 * (x * z - w * y)
-    c[1, 2] = 2.0 * (y * z - w * x)
-    c[2, 1] = 2.0 * (y * z + w * x)
+    fill_dcm(q, c)
     return c
 
 

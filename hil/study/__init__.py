@@ -11,6 +11,7 @@ _MODULES = {
     "orientation": "hil.study.orientation",
     "navigation": "hil.study.navigation",
     "pendulum": "hil.study.pendulum",
+    "drift": "hil.study.drift",
 }
 """Studies by name: modules with a function ``run() -> Study``."""
 
