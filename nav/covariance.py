@@ -21,9 +21,6 @@ import numpy as np
 from nav.error_dynamics import STATES, fill_dynamics, fill_input, fill_transition
 from nav.errors import HilError
 from nav.increments import FloatArray
-from nav.instruments.channels import Triple
-from nav.instruments.grades import Grade
-from nav.instruments.noise import flicker_processes
 from nav.kernel import inline_kernel, kernel
 from nav.rotation import fill_dcm
 
@@ -96,59 +93,6 @@ class Source:
     times: FloatArray = field(default_factory=_none)
 
 
-def combination(channels: tuple[Triple, ...]) -> FloatArray:
-    """(3, c): increments in b from those of channels along body axes; channels of one axis are averaged.
-
-    Parameters
-    ----------
-    channels : tuple of (3,) int
-        The first of each is its axis.
-    """
-    return np.asarray(np.linalg.pinv(np.eye(3)[[triple[0] for triple in channels]]), np.float64)
-
-
-def grade_sources(grade: Grade, step: float, *, bias_removed: bool = False) -> tuple[Source, ...]:
-    """Sources of instruments of a grade, one sigma: what :meth:`Grade.draw` draws and its noises.
-
-    Parameters
-    ----------
-    grade : Grade
-    step : float
-        Of the sensors, s: the shortest correlation time of their flicker.
-    bias_removed : bool
-        As in `Grade.draw`.
-    """
-    i, o, s = np.array(grade.gyro_channels).T
-    gyro, force = np.zeros((len(i), 6)), np.zeros((3, 6))
-    gyro[:, :3], force[:, 3:] = combination(grade.gyro_channels).T, np.eye(3)
-    one, rate, pull = 0, 1, 4  # where r holds 1, w_ib_b, f_b
-    x = np.arange(3)
-
-    def constant(name: str, sigma: float, directions: FloatArray, *places: FloatArray) -> Source:
-        patterns = np.zeros((len(places), len(directions), 6, 7))
-        for pattern, place in zip(patterns, places, strict=True):
-            pattern[np.arange(len(directions)), :, place] = sigma * directions
-        return Source(name, constant=patterns.reshape(-1, 6, 7))
-
-    def flicker(name: str, value: float, directions: FloatArray) -> Source:
-        times, sigma = flicker_processes(value, step)
-        return Source(name, drift=sigma * directions, times=times)
-
-    bias = grade.gyro_bias_removed if bias_removed else grade.gyro_bias
-    return (
-        constant("gyro bias", bias, gyro, one + 0 * i),
-        constant("gyro scale factor", grade.gyro_scale, gyro, rate + i),
-        constant("gyro misalignment", grade.gyro_misalignment, gyro, rate + o, rate + s),
-        constant("g-sensitive drift", grade.gyro_g, gyro, pull + i, pull + o),
-        Source("angle random walk", white=grade.gyro_white * gyro),
-        flicker("gyro bias instability", grade.gyro_flicker, gyro),
-        constant("accelerometer bias", grade.accelerometer_bias, force, one + 0 * x),
-        constant("accelerometer scale factor", grade.accelerometer_scale, force, pull + x),
-        Source("velocity random walk", white=grade.accelerometer_white * force),
-        flicker("accelerometer bias instability", grade.accelerometer_flicker, force),
-    )
-
-
 def response(
     path: Path, start: FloatArray, constant: FloatArray, *, every: int = 1, height_held: bool = False
 ) -> FloatArray:
@@ -157,6 +101,7 @@ def response(
     Parameters
     ----------
     path : Path
+        True states in the middle of steps.
     start : (m, 9) float
         Errors at the start.
     constant : (m, 6, 7) float
@@ -171,6 +116,8 @@ def response(
     (n // every, m, 9) float
         At the end of each `every`th step.
     """
+    if start.shape != (len(start), STATES) or constant.shape != (len(start), 6, 7):
+        raise ValueError(f"response: expected (m, 9) and (m, 6, 7) arrays, got {start.shape} and {constant.shape}")
     out = np.empty((len(path.lat) // every, len(start), STATES))
     _respond(_table(path), path.step, height_held, every, np.array(start, float), np.ascontiguousarray(constant), out)
     return out
@@ -197,7 +144,7 @@ def _table(path: Path) -> FloatArray:
     return np.column_stack([path.lat, path.height, path.vel_n, path.q_nb, path.w_ib_b, path.f_b])
 
 
-@inline_kernel
+@kernel
 def _linearize(
     row: FloatArray, step: float, held: bool, c: FloatArray, f: FloatArray, phi: FloatArray, gain: FloatArray
 ) -> None:

@@ -29,7 +29,9 @@ POSITION, VELOCITY, ATTITUDE = slice(0, 3), slice(3, 6), slice(6, 9)
 
 
 @kernel
-def fill_dynamics(lat: float, height: float, vel_n: FloatArray, c_nb: FloatArray, f_b: FloatArray, f: FloatArray) -> None:
+def fill_dynamics(
+    lat: float, height: float, vel_n: FloatArray, c_nb: FloatArray, f_b: FloatArray, f: FloatArray
+) -> None:
     """Fill F of x' = F x.
 
     Parameters

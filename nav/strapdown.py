@@ -296,7 +296,8 @@ def _entry() -> Any:
     """The compiled `push` without numba's dispatcher, which costs as much as the step."""
     kernel: Any = kernels.push
     if not kernel.signatures:
-        kernel(np.zeros(kernels.CORE).ctypes.data, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        core = np.zeros(kernels.CORE)  # by name: it must outlive the call
+        kernel(core.ctypes.data, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     return next(iter(kernel.overloads.values())).entry_point
 
 

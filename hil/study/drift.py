@@ -6,24 +6,28 @@ vertical velocity are set to the true ones every second, as an ideal altimeter w
 """
 
 import math
+import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hil.geometry import position_error
 from hil.study.navigation import CHUNK, DURATION_S, flight
 from hil.study.report import Band, Line, Plot, Row, Study, near, shown
 from hil.world.motion import Motion
-from nav.covariance import Path, budget, combination, grade_sources
+from nav.covariance import Path, budget
 from nav.increments import FloatArray
 from nav.instruments.accelerometer_errors import Accelerometers
 from nav.instruments.grades import GRADES, Grade
 from nav.instruments.gyro_errors import Gyros
+from nav.instruments.sources import combination, grade_sources
 from nav.strapdown import Strapdown
 
-STEP, PATH_STEP = 0.01, 0.1
-"""Of the sensors, and of the covariance, s."""
-SEEDS = 100
+STEP, PATH_STEP, LOOK_S = 0.01, 0.1, 1.0
+"""Of the sensors, of the covariance, and between comparisons, s."""
+SEEDS = 64
 OTHERS = {"tactical": 600.0, "mems": 120.0}
 """Other grades, and for how long their errors stay small enough to be called linear, s."""
 SHOWN_RUNS = 10
@@ -65,49 +69,57 @@ class Drift:
         return float(np.einsum("si,si->", end, np.linalg.solve(self.covariance[-1], end.T).T) / end.size)
 
 
-def drift(grade: Grade, duration: float, seeds: int, *, height_held: bool = False) -> Drift:
-    """Fly `seeds` runs with instruments of a grade, its gyros' bias removed at rest as far as the grade says."""
+def drift(grade: Grade, duration: float, seeds: int) -> tuple[Drift, Drift]:
+    """Fly `seeds` runs with instruments of a grade: free, and with the height held.
+
+    The bias of the gyros has been removed at rest as far as the grade says.
+    """
     motion, n = Motion(flight("smooth")), round(duration / STEP)
     dtheta, dvel = np.empty((n, 3)), np.empty((n, 3))
     motion.increments(0, n, STEP, dtheta, dvel)
-    errors = [_run(motion, grade, dtheta, dvel, seed, height_held) for seed in range(seeds)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # kernels and generators let go of the interpreter
+        runs = np.array(list(pool.map(lambda seed: _run(motion, grade, dtheta, dvel, seed), range(seeds))))
     middles = motion.truth((np.arange(round(duration / PATH_STEP)) + 0.5) * PATH_STEP)
     path = Path(PATH_STEP, *(middles[name] for name in ("lat", "height", "vel_n", "q_nb", "w_ib_b", "f_b")))
-    sources = grade_sources(grade, STEP, bias_removed=True)
-    parts = budget(path, sources, every=round(1.0 / PATH_STEP), height_held=height_held)
-    return Drift(np.array(errors), {name: part[:, :3, :3] for name, part in parts.items()})
+    sources, every = grade_sources(grade, STEP, bias_removed=True), round(LOOK_S / PATH_STEP)
+    free, held = (
+        {name: part[:, :3, :3] for name, part in budget(path, sources, every=every, height_held=height_held).items()}
+        for height_held in (False, True)
+    )
+    return Drift(runs[:, 0], free), Drift(runs[:, 1], held)
 
 
-def _run(
-    motion: Motion, grade: Grade, dtheta: FloatArray, dvel: FloatArray, seed: int, height_held: bool
-) -> FloatArray:
-    """Position errors (n, 3) of one run, a row a second."""
+def _run(motion: Motion, grade: Grade, dtheta: FloatArray, dvel: FloatArray, seed: int) -> FloatArray:
+    """Position errors (2, n, 3) of one run, free and with the height held."""
     turn_on, gyro_noise, force_noise = np.random.default_rng(seed).spawn(3)
     gyro_errors, force_errors = grade.draw(turn_on, bias_removed=True)
     gyros, forces = Gyros(gyro_errors, STEP, gyro_noise), Accelerometers(force_errors, STEP, force_noise)
     to_body = combination(grade.gyro_channels).T
-    start = motion.truth([0.0])[0]
+    turned, pushed = np.empty_like(dtheta), np.empty_like(dvel)
+    for first in range(0, len(dtheta), CHUNK):
+        some = slice(first, first + CHUNK)
+        turned[some] = gyros.sense(dtheta[some], dvel[some]) @ to_body
+        pushed[some] = forces.sense(dvel[some])
+    stride = round(LOOK_S / STEP)
+    truth = motion.truth(np.arange(len(dtheta) // stride + 1) * LOOK_S)
+    return np.array([_navigate(truth, turned, pushed, length) for length in (len(dtheta), stride)])
+
+
+def _navigate(truth: NDArray[np.void], dtheta: FloatArray, dvel: FloatArray, length: int) -> FloatArray:
+    """Position errors (n, 3); height and vertical velocity become the true ones after each `length` steps."""
+    n, stride, start = len(dtheta), round(LOOK_S / STEP), truth[0]
     core = Strapdown("two-sample")
     core.start(start["lat"], start["lon"], start["height"], start["vel_n"], start["q_nb"])
-    n, second = len(dtheta), round(1.0 / STEP)
-    truth = motion.truth(np.arange(1, n // second + 1) * 1.0)
-    position, velocity, attitude = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
-    steps = np.full(n, STEP)
-    for first in range(0, n, CHUNK):
-        some = slice(first, min(first + CHUNK, n))
-        turned = gyros.sense(dtheta[some], dvel[some]) @ to_body
-        pushed = forces.sense(dvel[some])
-        length = second if height_held else len(turned)
-        for begin in range(0, len(turned), length):
-            part, there = slice(begin, begin + length), slice(first + begin, first + begin + length)
-            out = position[there], velocity[there], attitude[there]
-            core.advance(steps[there], turned[part], pushed[part], np.zeros(3), *out)
-            if height_held:
-                row = truth[there.stop // second - 1]
-                core.solution[2], core.solution[5] = row["height"], row["vel_n"][2]
-                core.hand_over("geographic")
-    lat, lon, height = np.ascontiguousarray(position[second - 1 :: second].T)
-    return position_error(lat, lon, height, truth)
+    position, velocity, attitude, steps = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)), np.full(n, STEP)
+    for first in range(0, n, length):
+        some = slice(first, first + length)
+        out = position[some], velocity[some], attitude[some]
+        core.advance(steps[some], dtheta[some], dvel[some], np.zeros(3), *out)
+        row = truth[(first + length) // stride]
+        core.solution[2], core.solution[5] = row["height"], row["vel_n"][2]
+        core.hand_over("geographic")
+    lat, lon, height = np.ascontiguousarray(position[stride - 1 :: stride].T)
+    return position_error(lat, lon, height, truth[1:])
 
 
 def _compared(key: str, what: str, found: Drift, axes: int, *, limited: bool) -> list[Row]:
@@ -158,7 +170,7 @@ def _plots(found: Drift, held: Drift) -> list[Plot]:
 
 def run(seeds: int = SEEDS, duration: float = DURATION_S) -> Study:
     """All of it; the other grades fly no longer than `duration`."""
-    free, held = (drift(GRADES["dtg"], duration, seeds, height_held=held) for held in (False, True))
+    free, held = drift(GRADES["dtg"], duration, seeds)
     where = f"DTG head, {duration:g} s, {seeds} runs"
     rows = _compared("dtg-3d", f"{where}, 3-D", free, 3, limited=True)
     rows += _compared("dtg-horizontal", f"{where}, horizontal", free, 2, limited=True)
@@ -167,8 +179,8 @@ def run(seeds: int = SEEDS, duration: float = DURATION_S) -> Study:
     rows.append(shown("dtg-consistency", what, free.consistency(), "1", reference=1.0))
     for name, longest in OTHERS.items():
         other = min(longest, duration)
-        found = drift(GRADES[name], other, seeds)
-        rows += _compared(f"{name}-3d", f"{name}, {other:g} s, {seeds} runs, 3-D", found, 3, limited=False)
+        found, _ = drift(GRADES[name], other, seeds)
+        rows += _compared(f"{name}-3d", f"{GRADES[name].name}, {other:g} s, {seeds} runs, 3-D", found, 3, limited=False)
     rows += _budget(free, held)
     about = (
         "The built-in flight, 2050 s, exact increments at 100 Hz, instruments drawn for each run from the table of grades, true "

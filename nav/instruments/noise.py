@@ -88,7 +88,8 @@ def flicker_processes(flicker: float, step: float) -> tuple[FloatArray, float]:
         Length of a step, s: the shortest of the times.
     """
     terms = math.ceil(math.log(_LONGEST / step) / math.log(_RATIO)) + 1 if flicker > 0.0 else 0
-    return step * _RATIO ** np.arange(terms), flicker * math.sqrt(math.log(_RATIO) / math.pi)
+    times: FloatArray = np.asarray(step * _RATIO ** np.arange(terms), np.float64)
+    return times, flicker * math.sqrt(math.log(_RATIO) / math.pi)
 
 
 class Noise:
