@@ -162,7 +162,7 @@ def _plots(found: Drift, held: Drift) -> list[Plot]:
         title = f"Position error, DTG head, {axis}{', height held' if part is held else ''}"
         plots.append(Plot(axis, title, "s", "m", lines, bands=[Band("1 sigma", time, -sigma, sigma)]))
     lines = []
-    for what, part, axes in (("3-D", found, 3), ("horizontal", found, 2), ("horizontal, height held", held, 2)):
+    for what, part, axes in (("3-D", found, 3), ("horizontal, height held", held, 2)):
         lines += [Line(f"{what}: rms", time, part.rms(axes)), Line(f"{what}: sigma", time, part.sigma(axes), "--")]
     plots.append(Plot("rms", "Growth of the position error, DTG head", "s", "m", lines))
     return plots
