@@ -61,3 +61,23 @@ def normal_gravity(sin_lat: float, height: float) -> float:
     s2 = sin_lat * sin_lat
     g0 = GE * (1.0 + _K * s2) / math.sqrt(1.0 - E2 * s2)
     return g0 * (1.0 - 2.0 / A * (1.0 + F + _M - 2.0 * F * s2) * height + 3.0 * height * height / (A * A))
+
+
+@inline_kernel
+def normal_gravity_gradient(sin_lat: float, cos_lat: float, height: float) -> tuple[float, float]:
+    """Derivatives of :func:`normal_gravity` by latitude, m/s^2/rad, and by height, 1/s^2.
+
+    Parameters
+    ----------
+    sin_lat, cos_lat : float
+        Of the geodetic latitude.
+    height : float
+        Height above the ellipsoid, m.
+    """
+    s2 = sin_lat * sin_lat
+    w2 = 1.0 - E2 * s2
+    g0 = GE * (1.0 + _K * s2) / math.sqrt(w2)
+    slope = 2.0 / A * (1.0 + F + _M - 2.0 * F * s2)
+    factor = 1.0 - slope * height + 3.0 * height * height / (A * A)
+    by_s2 = g0 * factor * (_K / (1.0 + _K * s2) + 0.5 * E2 / w2) + g0 * 4.0 * F / A * height
+    return 2.0 * sin_lat * cos_lat * by_s2, g0 * (6.0 * height / (A * A) - slope)

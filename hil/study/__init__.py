@@ -7,7 +7,7 @@ from typing import Any
 from hil.study.report import Study, write
 from nav.errors import HilError
 
-_MODULES = {name: f"hil.study.{name}" for name in ("orientation", "navigation", "noise", "dtg", "pendulum")}
+_MODULES = {name: f"hil.study.{name}" for name in ("orientation", "navigation", "noise", "dtg", "pendulum", "drift")}
 """Studies by name: modules with a function ``run() -> Study``."""
 
 

@@ -101,6 +101,16 @@ class Line:
 
 
 @dataclass(frozen=True, slots=True)
+class Band:
+    """A shaded band of a figure."""
+
+    label: str
+    x: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Plot:
     """A figure as data: drawn only where it is written."""
 
@@ -110,6 +120,7 @@ class Plot:
     y_label: str
     lines: Sequence[Line]
     log: bool = False
+    bands: Sequence[Band] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +185,8 @@ def _draw(plot: Plot) -> str:
         for i, line in enumerate(plot.lines):
             style = line.style.replace("-", ("-", "--", ":")[i // 10 % 3])  # after ten lines the colours come again
             axes.plot(line.x, line.y, style, label=line.label or None, linewidth=1.2, markersize=4)
+        for band in plot.bands:
+            axes.fill_between(band.x, band.low, band.high, alpha=0.2, label=band.label)
         if plot.log:
             axes.set_xscale("log")
             axes.set_yscale("log")
@@ -181,7 +194,7 @@ def _draw(plot: Plot) -> str:
         axes.set_ylabel(plot.y_label)
         axes.set_title(plot.title)
         axes.grid(alpha=0.3)
-        if len(plot.lines) > 1:
+        if len(plot.lines) + len(plot.bands) > 1:
             figure.legend(fontsize="x-small", loc="outside right upper")
         buffer = io.StringIO()
         figure.savefig(buffer, format="svg", metadata={"Date": None})

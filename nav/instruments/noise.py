@@ -80,6 +80,21 @@ def _run(
             out[k, c] = total * step
 
 
+def flicker_processes(flicker: float, step: float) -> tuple[FloatArray, float]:
+    """Correlation times (p,), s, of the Gauss-Markov processes that make up flicker, and the deviation of each.
+
+    Parameters
+    ----------
+    flicker : float
+        B; none are needed for 0.
+    step : float
+        Length of a step, s: the shortest of the times.
+    """
+    terms = math.ceil(math.log(_LONGEST / step) / math.log(_RATIO)) + 1 if flicker > 0.0 else 0
+    times: FloatArray = np.asarray(step * _RATIO ** np.arange(terms), np.float64)
+    return times, flicker * math.sqrt(math.log(_RATIO) / math.pi)
+
+
 class Noise:
     """A stream of noise increments; the same bytes however it is split into calls.
 
@@ -98,10 +113,8 @@ class Noise:
     def __init__(self, model: NoiseModel, step: float, channels: int, rng: np.random.Generator) -> None:
         if not 0.0 < step < math.inf:
             raise HilError(f"noise: a step of {step:g} s; it must be positive")
-        terms = math.ceil(math.log(_LONGEST / step) / math.log(_RATIO)) + 1 if model.flicker > 0.0 else 0
-        times = step * _RATIO ** np.arange(terms)
-        decay = np.exp(-step / times)
-        sigma = model.flicker * math.sqrt(math.log(_RATIO) / math.pi)
+        times, sigma = flicker_processes(model.flicker, step)
+        terms, decay = len(times), np.exp(-step / times)
         self._step, self._ramp, self._rng = step, model.ramp, rng
         self._decay = np.concatenate([[0.0, 1.0], decay])
         self._drive = np.concatenate(

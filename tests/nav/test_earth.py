@@ -82,3 +82,15 @@ def exact_gravity(x, z):
         (potential(x, z + h) - potential(x, z - h)) / (2 * h),
     ]
     return slope[0] - gm * x / r**3, slope[1] - gm * z / r**3
+
+
+@given(st.floats(-90, 90), st.floats(-400, 20000))
+def test_gradient_of_gravity(lat_deg, height):
+    lat, h = math.radians(lat_deg), 1e-3
+
+    def gravity(change, rise):
+        return earth.normal_gravity(math.sin(lat + change), height + rise)
+
+    by_lat, by_height = earth.normal_gravity_gradient(math.sin(lat), math.cos(lat), height)
+    assert by_lat == pytest.approx((gravity(h, 0.0) - gravity(-h, 0.0)) / (2 * h), abs=2e-7)
+    assert by_height == pytest.approx((gravity(0.0, 50.0) - gravity(0.0, -50.0)) / 100.0, rel=1e-8)
