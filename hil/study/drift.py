@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.geometry import position_error
-from hil.study.navigation import CHUNK, DURATION_S, flight
+from hil.study.navigation.flights import CHUNK, DURATION_S, flight
 from hil.study.report import Band, Line, Plot, Row, Study, near, shown
 from hil.world.motion import Motion
 from nav.covariance import Path, budget
@@ -74,7 +74,7 @@ def drift(grade: Grade, duration: float, seeds: int) -> tuple[Drift, Drift]:
 
     The bias of the gyros has been removed at rest as far as the grade says.
     """
-    motion, n = Motion(flight("smooth")), round(duration / STEP)
+    motion, n = flight("smooth"), round(duration / STEP)
     dtheta, dvel = np.empty((n, 3)), np.empty((n, 3))
     motion.increments(0, n, STEP, dtheta, dvel)
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # kernels and generators let go of the interpreter
