@@ -7,7 +7,10 @@ from typing import Any
 from hil.study.report import Study, write
 from nav.errors import HilError
 
-_MODULES = {name: f"hil.study.{name}" for name in ("orientation", "navigation", "noise", "dtg", "pendulum", "drift")}
+_MODULES = {
+    name: f"hil.study.{name}"
+    for name in ("orientation", "navigation", "noise", "dtg", "pendulum", "redundancy", "drift")
+}
 """Studies by name: modules with a function ``run() -> Study``."""
 
 

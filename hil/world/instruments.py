@@ -101,7 +101,8 @@ def limits_of(head: HeadConfig) -> Limits:
     return Limits(
         grade.gyro_white,
         grade.accelerometer_white,
-        5.0 * (grade.gyro_scale + grade.gyro_misalignment),
+        grade.gyro_scale,
+        grade.gyro_misalignment,
         GYRO_RANGE,
         limit,
     )
@@ -213,7 +214,10 @@ class Faulty:
         return sensed
 
 
-def instruments(scenario: Scenario, step: float) -> IdealInstruments | DtgInstruments | Faulty:
+Instruments = IdealInstruments | DtgInstruments | Faulty
+
+
+def instruments(scenario: Scenario, step: float) -> Instruments:
     """The instruments of a scenario, sampled every `step` s."""
     inner = IdealInstruments(scenario, step) if scenario.head.instruments == "ideal" else DtgInstruments(scenario, step)
     return Faulty(inner, scenario, step) if scenario.head.faults else inner

@@ -96,6 +96,8 @@ class HeadCombiner:
     ----------
     faults : (7,) int
         `Fault` of each of `nav.instruments.redundancy.AXES`.
+    residual : (n,) float
+        Parity residual of each sample of the last batch, rad; zero once an axis is lost.
     """
 
     def __init__(self, model: HeadModel) -> None:
@@ -108,11 +110,12 @@ class HeadCombiner:
         self._size_memory = np.zeros(SIZE_MEMORY)
         limits = model.limits
         self._limits = (
-            *(limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale),
+            *(limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale, limits.gyro_misalignment),
             *(limits.gyro_range, limits.accelerometer_range),
         )
         self._notes: list[Note] = []
         self.faults = np.zeros(7, np.int64)
+        self.residual = np.zeros(0)
         self._room(256)
         self.renew()
 
@@ -140,7 +143,7 @@ class HeadCombiner:
         if n > len(self._imu):
             self._room(2 * n)
         gyro, dtheta, dvel = self._gyro[:n], self._imu.dtheta[:n], self._imu.dvel[:n]
-        validity = self._imu.validity[:n]
+        validity, self.residual = self._imu.validity[:n], self._residuals[:n]
         if self._lag is None:
             gyro[:] = head.dtheta
         else:
@@ -165,7 +168,7 @@ class HeadCombiner:
                 self._parity,
                 self._limits,
                 self._pair,
-                self._residual[start:stop],
+                self.residual[start:stop],
             )
             part = slice(start, start + done)
             _combine(gyro[part], dvel[part], self._inverse, self._flag, dtheta[part], validity[part])
@@ -244,4 +247,4 @@ class HeadCombiner:
 
     def _room(self, n: int) -> None:
         self._imu = ImuIncrements.empty(n)
-        self._gyro, self._residual = np.zeros((n, 4)), np.zeros(n)
+        self._gyro, self._residuals = np.zeros((n, 4)), np.zeros(n)

@@ -9,7 +9,7 @@ space and the parity vector has four equal parts.
 
 Parity: the unit vector p with p H = 0 takes the motion out of the four measurements; p m is noise, unless an axis fails. One
 number tells that something is wrong, not what: the axis is named by the own-signal tests, or, for a jump of the orthogonal
-pair, by which of the two axes changed while the other did not.
+pair, by which of the two axes changed while the other stood still. In a manoeuvre neither does, and nothing tells them apart.
 
 Own-signal tests, on every axis: stuck (the same number for `STUCK_S`), noise (mean square of the sixth difference, which a
 motion slower than a tenth of the sample rate does not reach), saturation, and what the head says itself. A failed axis stays
@@ -36,8 +36,9 @@ NOISE_LIMIT = 30.0
 """Noise above the nominal by this factor is a fault."""
 PARITY_BLOCK_S, PARITY_BLOCKS = 0.005, 10
 """The parity residual is averaged over ten blocks of 5 ms."""
-PARITY_SIGMAS = 6.5
-"""The averaged residual is a fault above this many of its standard deviations and what the scale factors allow."""
+PARITY_SIGMAS, TURN_ON_SIGMAS = 6.5, 4.0
+"""The averaged residual is a fault above so many standard deviations of its noise, and of what scale factors and
+misalignments make of the mean rate."""
 _DIFFERENCE_GAIN = 924.0
 """Sum of the squares of the sixth difference's coefficients."""
 
@@ -62,8 +63,8 @@ class Limits:
     ----------
     gyro_noise, accelerometer_noise : float
         Angle and velocity random walk, rad/sqrt(s) and m/s/sqrt(s); 0 switches the stuck, noise and parity tests off.
-    gyro_scale : float
-        How far two axes may differ in proportion to the rate (scale factor and misalignment).
+    gyro_scale, gyro_misalignment : float
+        Standard deviations of scale factors and misalignments (rad) between the axes.
     gyro_range, accelerometer_range : float
         Saturation, rad/s and m/s^2.
     """
@@ -71,6 +72,7 @@ class Limits:
     gyro_noise: float = 0.0
     accelerometer_noise: float = 0.0
     gyro_scale: float = 0.0
+    gyro_misalignment: float = 0.0
     gyro_range: float = math.inf
     accelerometer_range: float = math.inf
 
@@ -107,10 +109,10 @@ def combination(h: FloatArray, weights: FloatArray) -> FloatArray | None:
 
 # Layout of the memory: for each axis 6 older increments, the last raw one, time unchanged, squares, their count | time of the
 # last sample, in the noise block | place in the ring, blocks in it | ring, and the block that is filled now: time, sums of
-# the residual, of the largest |increment|, of g1y and of g2y.
+# the residual and of the four gyro axes.
 _OLD, _LAST, _SAME, _SQUARES, _COUNT, _AXIS = 0, 6, 7, 8, 9, 10
 _TIME, _NOISE_TIME, _SLOT, _FILLED, _RING = (7 * _AXIS + k for k in range(5))
-_WIDTH = 5
+_WIDTH = 6
 _RING_BLOCKS = 2 * PARITY_BLOCKS
 MEMORY = _RING + _WIDTH * (_RING_BLOCKS + 1)
 """Floats that the tests remember."""
@@ -174,7 +176,7 @@ def examine(
     gyro: FloatArray,
     accelerometer: FloatArray,
     parity: FloatArray,
-    limits: tuple[float, float, float, float, float],
+    limits: tuple[float, float, float, float, float, float],
     pair: bool,
     residual: FloatArray,
 ) -> int:
@@ -206,7 +208,7 @@ def examine(
     int
         n, or fewer: `faults` has changed with the last sample examined.
     """
-    gyro_noise, accelerometer_noise, scale, gyro_range, accelerometer_range = limits
+    gyro_noise, accelerometer_noise, scale, misalignment, gyro_range, accelerometer_range = limits
     ring_end = _RING + _WIDTH * _RING_BLOCKS
     for k in range(time.shape[0]):
         t = step[k]
@@ -244,16 +246,13 @@ def examine(
             changed = changed or fault != faults[axis]
             faults[axis] = fault
 
-        r = rate = 0.0
+        r = 0.0
         for axis in range(4):
             r += parity[axis] * gyro[k, axis]
-            rate = max(rate, abs(gyro[k, axis]))
+            memory[ring_end + 2 + axis] += gyro[k, axis]
         residual[k] = r
         memory[ring_end] += t
         memory[ring_end + 1] += r
-        memory[ring_end + 2] += rate
-        memory[ring_end + 3] += gyro[k, 1]
-        memory[ring_end + 4] += gyro[k, 2]
         if memory[ring_end] >= PARITY_BLOCK_S - 1e-9:
             slot = int(memory[_SLOT])
             for i in range(_WIDTH):
@@ -263,7 +262,7 @@ def examine(
             memory[_FILLED] = min(memory[_FILLED] + 1.0, float(_RING_BLOCKS))
             told = (faults[0] | faults[1] | faults[2] | faults[3]) & 16
             if gyro_noise > 0.0 and memory[_FILLED] >= PARITY_BLOCKS and not told:
-                named = _judge_parity(memory, slot, gyro_noise, scale, pair)
+                named = _judge_parity(memory, slot, parity, gyro_noise, scale, misalignment, pair)
                 for axis in range(4):
                     if named & 1 << axis and not faults[axis] & 16:
                         faults[axis] |= 16
@@ -274,29 +273,31 @@ def examine(
 
 
 @kernel
-def _judge_parity(memory: FloatArray, slot: int, noise: float, scale: float, pair: bool) -> int:
-    """Compare the averaged residual with what noise and scale factors allow: bits of the axes that may be wrong."""
-    time = total = rate = new1 = new2 = old1 = old2 = old_time = 0.0
+def _judge_parity(
+    memory: FloatArray, slot: int, parity: FloatArray, noise: float, scale: float, misalignment: float, pair: bool
+) -> int:
+    """Compare the averaged residual with what is allowed: bits of the axes that may be wrong."""
+    time = residual = a = b = c = d = old_b = old_c = old_time = 0.0
     for i in range(int(memory[_FILLED])):
         at = _RING + _WIDTH * ((slot - i) % _RING_BLOCKS)
         if i < PARITY_BLOCKS:
             time += memory[at]
-            total += memory[at + 1]
-            rate += memory[at + 2]
-            new1 += memory[at + 3]
-            new2 += memory[at + 4]
+            residual += memory[at + 1]
+            a, b, c, d = a + memory[at + 2], b + memory[at + 3], c + memory[at + 4], d + memory[at + 5]
         else:
             old_time += memory[at]
-            old1 += memory[at + 3]
-            old2 += memory[at + 4]
-    if abs(total) <= PARITY_SIGMAS * noise * math.sqrt(time) + scale * rate:
+            old_b, old_c = old_b + memory[at + 3], old_c + memory[at + 4]
+    scaled = math.sqrt((parity[0] * a) ** 2 + (parity[1] * b) ** 2 + (parity[2] * c) ** 2 + (parity[3] * d) ** 2)
+    turn_on = scale * scaled + misalignment * math.sqrt(a * a + b * b + c * c + d * d)
+    if abs(residual) <= PARITY_SIGMAS * noise * math.sqrt(time) + TURN_ON_SIGMAS * turn_on:
         return 0
     if not pair:
         return 0b1111
-    if old_time > 0.0:  # which of the two changed, and the other did not?
-        change1, change2 = abs(new1 / time - old1 / old_time), abs(new2 / time - old2 / old_time)
-        if change1 > 2.0 * change2:
+    if old_time > 0.0:  # which of the two changed, while the other stood still but for its noise?
+        still = PARITY_SIGMAS * noise * math.sqrt(1.0 / time + 1.0 / old_time)
+        change_b, change_c = abs(b / time - old_b / old_time), abs(c / time - old_c / old_time)
+        if change_c <= still < change_b:
             return 0b0010
-        if change2 > 2.0 * change1:
+        if change_b <= still < change_c:
             return 0b0100
     return 0b0110

@@ -18,7 +18,7 @@ from nav.instruments.redundancy import Fault, Limits, layout
 
 STEP = 1e-3
 SKEW = math.radians(45.0)
-LIMITS = Limits(6e-7, 5e-5, 2e-4, 3.0, 300.0)
+LIMITS = Limits(6e-7, 5e-5, 5e-5, 2.5e-5, 3.0, 300.0)
 
 
 def head(dtheta, dvel, rotor=None):

@@ -23,7 +23,7 @@ STEP = 1e-3
 ARW = math.radians(0.002) / 60.0
 """0.002 deg/sqrt(h), rad/sqrt(s)."""
 VRW = 5e-6 * 9.80665
-LIMITS = Limits(ARW, VRW, 2e-4, 2.0, 200.0)
+LIMITS = Limits(ARW, VRW, 5e-5, 2.5e-5, 2.0, 200.0)
 SKEW = math.radians(45.0)
 
 
@@ -46,7 +46,7 @@ def examined(skew, data, limits=LIMITS):
     time, step, gyro, accelerometer = data
     memory, faults, parity = fresh_memory(), np.zeros(7, np.int64), parity_vector(layout(skew))
     residual, found, at = np.zeros(len(time)), [], 0
-    values = (limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale)
+    values = (limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale, limits.gyro_misalignment)
     values = (*values, limits.gyro_range, limits.accelerometer_range)
     while at < len(time):
         before = faults.copy()
@@ -139,7 +139,7 @@ def test_own_signal_tests_find_it_in_two_hundred_milliseconds(axis, kind):
 def test_saturation_comes_and_goes():
     time, _, gyro, _ = data = head(0.0, 2.0)
     gyro[(time > 1.0) & (time < 1.1), 3] = 2.1 * STEP
-    limits = Limits(0.0, 0.0, 0.0, 2.0, 200.0)
+    limits = Limits(0.0, 0.0, 0.0, 0.0, 2.0, 200.0)
     found, faults = examined(0.0, data, limits)
     assert [(round(t, 3), name, fault) for t, name, fault in found] == [
         (1.001, "g2z", Fault.SATURATED),
@@ -167,7 +167,7 @@ def test_how_a_stream_is_split_does_not_matter(cuts):
     gyro[1500:, 0] = 0.0
     whole = examined(0.0, (time, step, gyro, accelerometer))
     memory, faults, parity = fresh_memory(), np.zeros(7, np.int64), parity_vector(layout(0.0))
-    values, residual, found = (ARW, VRW, 2e-4, 2.0, 200.0), np.zeros(len(time)), []
+    values, residual, found = (ARW, VRW, 5e-5, 2.5e-5, 2.0, 200.0), np.zeros(len(time)), []
     edges = [0, *np.cumsum(cuts).clip(max=len(time)).tolist(), len(time)]
     at = 0
     for stop in edges[1:]:
