@@ -9,7 +9,7 @@ space and the parity vector has four equal parts.
 
 Parity: the unit vector p with p H = 0 takes the motion out of the four measurements; p m is noise, unless an axis fails. One
 number tells that something is wrong, not what: the axis is named by the own-signal tests, or, for a jump of the orthogonal
-pair, by which of the two axes changed while the other stood still. In a manoeuvre neither does, and nothing tells them apart.
+pair, by which of the two changed while all other axes stood still. In a manoeuvre nothing tells them apart.
 
 Own-signal tests, on every axis: stuck (the same number for `STUCK_S`), noise (mean square of the sixth difference, which a
 motion slower than a tenth of the sample rate does not reach), saturation, and what the head says itself. A failed axis stays
@@ -277,7 +277,7 @@ def _judge_parity(
     memory: FloatArray, slot: int, parity: FloatArray, noise: float, scale: float, misalignment: float, pair: bool
 ) -> int:
     """Compare the averaged residual with what is allowed: bits of the axes that may be wrong."""
-    time = residual = a = b = c = d = old_b = old_c = old_time = 0.0
+    time = residual = a = b = c = d = old_a = old_b = old_c = old_d = old_time = 0.0
     for i in range(int(memory[_FILLED])):
         at = _RING + _WIDTH * ((slot - i) % _RING_BLOCKS)
         if i < PARITY_BLOCKS:
@@ -286,18 +286,18 @@ def _judge_parity(
             a, b, c, d = a + memory[at + 2], b + memory[at + 3], c + memory[at + 4], d + memory[at + 5]
         else:
             old_time += memory[at]
-            old_b, old_c = old_b + memory[at + 3], old_c + memory[at + 4]
+            old_a, old_b = old_a + memory[at + 2], old_b + memory[at + 3]
+            old_c, old_d = old_c + memory[at + 4], old_d + memory[at + 5]
     scaled = math.sqrt((parity[0] * a) ** 2 + (parity[1] * b) ** 2 + (parity[2] * c) ** 2 + (parity[3] * d) ** 2)
     turn_on = scale * scaled + misalignment * math.sqrt(a * a + b * b + c * c + d * d)
     if abs(residual) <= PARITY_SIGMAS * noise * math.sqrt(time) + TURN_ON_SIGMAS * turn_on:
         return 0
     if not pair:
         return 0b1111
-    if old_time > 0.0:  # which of the two changed, while the other stood still but for its noise?
+    if old_time > 0.0:  # one that changed while all the others stood still
         still = PARITY_SIGMAS * noise * math.sqrt(1.0 / time + 1.0 / old_time)
-        change_b, change_c = abs(b / time - old_b / old_time), abs(c / time - old_c / old_time)
-        if change_c <= still < change_b:
-            return 0b0010
-        if change_b <= still < change_c:
-            return 0b0100
+        moved_a, moved_b = abs(a / time - old_a / old_time) > still, abs(b / time - old_b / old_time) > still
+        moved_c, moved_d = abs(c / time - old_c / old_time) > still, abs(d / time - old_d / old_time) > still
+        if not (moved_a or moved_d) and moved_b != moved_c:
+            return 0b0010 if moved_b else 0b0100
     return 0b0110
