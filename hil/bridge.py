@@ -289,6 +289,7 @@ class Loop:
             "navigation_digest": self._digest.hexdigest(),
             "gyro_bias_deg_h": [float(b) for b in np.degrees(self.navigator.gyro_bias) * 3600.0],
             "head": self.driver.identity(),
+            "failed_axes": self._combiner.failed(),
         }
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error

@@ -126,6 +126,10 @@ class HeadCombiner:
         self._status = 0
         self._weigh()
 
+    def failed(self) -> dict[str, str]:
+        """Axes that have failed, and how."""
+        return {AXES[k]: _words(Fault(int(self.faults[k]))) for k in np.flatnonzero(self.faults)}
+
     def notes(self) -> list[Note]:
         """What happened since the last call."""
         notes, self._notes = self._notes, []
@@ -204,9 +208,12 @@ class HeadCombiner:
         gyros = self.faults[:4]
         lost = (gyros & _LOST.value) != 0
         suspects = (gyros & Fault.PARITY.value) != 0
-        doubt = bool((suspects & ~lost).sum() > 1 and not (suspects & lost).any())
+        if (suspects & lost).any():  # found: the others are cleared
+            gyros[~lost] &= ~Fault.PARITY.value
+            suspects &= lost
+        doubt = bool((suspects & ~lost).sum() > 1)
         if not doubt:
-            lost |= suspects & ~(suspects & lost).any()
+            lost |= suspects
         inverse = redundancy.combination(self._h, np.where(lost, 0.0, 1.0))
         bad = inverse is None or doubt or bool((self.faults[4:] & _LOST.value).any())
         self._flag = int(Validity.SENSOR) if bad else int(Validity.SPARE) if lost.any() else 0
@@ -227,8 +234,7 @@ class HeadCombiner:
             if not self.faults[k] and not found:
                 self._notes.append(Note(time, False, f"axis {name} is good again"))
             elif found and not (found == Fault.PARITY and self._doubt):
-                what = str(found.name).lower().replace("_", "-").replace("|", " and ")
-                self._notes.append(Note(time, True, f"axis {name}: {what}; {self._consequence(int(k))}"))
+                self._notes.append(Note(time, True, f"axis {name}: {_words(found)}; {self._consequence(int(k))}"))
         if parity and self._doubt:
             self._notes.append(
                 Note(
@@ -248,3 +254,7 @@ class HeadCombiner:
     def _room(self, n: int) -> None:
         self._imu = ImuIncrements.empty(n)
         self._gyro, self._residuals = np.zeros((n, 4)), np.zeros(n)
+
+
+def _words(fault: Fault) -> str:
+    return str(fault.name).lower().replace("_", "-").replace("|", " and ")

