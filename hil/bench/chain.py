@@ -11,9 +11,11 @@ from drivers.can.codec import load_database
 from drivers.can.dtg_head import DtgHead, head_database_text
 from hil.bench.timing import Row, Sizes, Work, row, rows_in_turns
 from hil.bridge import Loop, LoopOrder, Outlets
-from hil.scenario import load
+from hil.scenario import Scenario, load
 from hil.world.head import SimulatedHead
+from hil.world.instruments import head_model
 from nav.increments import ImuIncrements
+from nav.instruments.head import HeadCombiner
 from nav.navigator import Navigator, Settings
 
 SAMPLES = 20_000
@@ -26,12 +28,33 @@ def rows(sizes: Sizes) -> list[Row]:
     chunks = list(head.chunks(SAMPLES))
     slow, batch = chunks[0][1], np.concatenate([part for _, _, part in chunks])
     works = [
-        Work("head", "simulated head: motion, increments, frames", partial(_draw, head), 2000),
+        Work("head", "simulated head, ideal: motion, increments, frames", partial(_draw, head), 2000),
+        *_dtg_head(scenario),
         *_driver(slow, batch),
         *_codec(batch),
         *_navigation(slow, batch),
     ]
     return [*rows_in_turns(works, sizes.repeats), *_loop(scenario, slow, batch, sizes.repeats)]
+
+
+def _dtg_head(scenario: Scenario) -> list[Work]:
+    """The head by its physics, and all that the core does about it."""
+    dtg = scenario.with_changes(head={"instruments": "dtg", "grade": "dtg"})
+    head, combiner, driver = SimulatedHead(dtg), HeadCombiner(head_model(dtg.head)), DtgHead()
+    chunks = list(head.chunks(SAMPLES))
+    driver.decode(chunks[0][1])
+    samples = driver.decode(np.concatenate([part for _, _, part in chunks]))
+
+    def compensate() -> None:
+        combiner.renew()
+        for i in range(0, len(samples), 1000):
+            combiner.combine(samples.rows(i, i + 1000))
+
+    what = "lag, tests, combination, size effect of all axes, batches of 1000"
+    return [
+        Work("head-dtg", "simulated head, rotors and pendulums at 8 kHz, DTG grade", partial(_draw, head), 2000),
+        Work("compensation", what, compensate, len(samples)),
+    ]
 
 
 def _draw(head: SimulatedHead) -> None:
