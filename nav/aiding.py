@@ -1,0 +1,46 @@
+"""What helps the navigator besides the inertial sensors: one row for each measurement, of any kind, at its own time.
+
+A row holds up to six values and their standard deviations. A value that is not there, or is not to be used, has an infinite
+standard deviation. Times are device times of the inertial sensor, in seconds, at which the measurement was true, not when it came.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Kind(IntEnum):
+    """What a row measures: its values, and the axes and units of their standard deviations."""
+
+    GNSS = 1
+    """lat, lon (rad), height above the ellipsoid (m), vel_n (3, m/s) of the antenna; sigmas north, east, down: 3 x m, 3 x m/s."""
+    BARO = 2
+    """Pressure height (m), with an offset of its own; sigma m."""
+    MAGNETIC = 3
+    """Magnetic flux in body axes (3, T); sigmas T."""
+    HEADING = 4
+    """True heading (rad), from an operator or a two-antenna receiver; sigma rad."""
+    ATTITUDE = 5
+    """Attitude q_nb (4, scalar first), from four antennas or another navigator; three sigmas about north, east, down, rad."""
+    BODY_VELOCITY = 6
+    """Velocity over the ground in body axes (3, m/s); infinite sigma where only some axes are known (a wheel, a keel)."""
+
+
+AIDING = np.dtype(
+    [
+        ("time", "<f8"),  # device time at which it was true, s
+        ("kind", "<i4"),
+        ("source", "<i4"),  # number of the receiver or sensor among those of its kind
+        ("value", "<f8", 6),
+        ("sigma", "<f8", 6),
+    ]
+)
+"""A measurement."""
+
+
+def aiding(time: float, kind: Kind, value: tuple[float, ...], sigma: tuple[float, ...], source: int = 0) -> np.void:
+    """One row of `AIDING`; what is left out of `value` and `sigma` is zero and infinite."""
+    row = np.zeros(1, AIDING)
+    row["time"], row["kind"], row["source"], row["sigma"] = time, kind, source, np.inf
+    row["value"][0, : len(value)], row["sigma"][0, : len(sigma)] = value, sigma
+    return row[0]
