@@ -1,7 +1,7 @@
 """What helps the navigator besides the inertial sensors: one row for each measurement, of any kind, at its own time.
 
 A row holds up to six values and their standard deviations. A value that is not there, or is not to be used, has an infinite
-standard deviation. Times are device times of the inertial sensor, in seconds, at which the measurement was true, not when it came.
+standard deviation. Times are device times of the inertial sensor, s, at which the measurement was true, not when it came.
 """
 
 from enum import IntEnum
@@ -43,4 +43,5 @@ def aiding(time: float, kind: Kind, value: tuple[float, ...], sigma: tuple[float
     row = np.zeros(1, AIDING)
     row["time"], row["kind"], row["source"], row["sigma"] = time, kind, source, np.inf
     row["value"][0, : len(value)], row["sigma"][0, : len(sigma)] = value, sigma
-    return row[0]
+    result: np.void = row[0]
+    return result
