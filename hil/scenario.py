@@ -91,6 +91,8 @@ class RotorConfig(_Model):
     """Cross-axis stiffness over polar inertia, D/J, 1/s^2."""
     damping_ratio: NotNegative = 9.0
     """Damping over equatorial inertia, f/A, 1/s."""
+    method: Literal["exact", "rk4"] = "exact"
+    """How the simulated rotor moves in its steps: by the matrix exponential, or by Runge-Kutta as source 001."""
 
 
 class FaultConfig(_Model):

@@ -139,7 +139,7 @@ class DtgInstruments:
         self._cases = [np.array([h[2 * g], h[2 * g + 1], np.eye(3)[2 - 2 * g]]) for g in range(2)]
         rotor = rotor_of(head.rotor)
         self._gain = -1.0 / rotor.lag
-        self._table = step_map(rotor, self._fine)
+        self._table = step_map(rotor, self._fine, head.rotor.method)
         seeds = np.random.SeedSequence(scenario.seed).spawn(4)
         errors = _drawn(head, np.random.default_rng(seeds[0]))
         self._gyros = [Gyros(_part(errors[0], g), step, np.random.default_rng(seeds[1 + g])) for g in range(2)]

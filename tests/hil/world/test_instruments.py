@@ -154,3 +154,9 @@ def test_a_lost_spare_costs_no_accuracy():
         ends.append(navigator.process(imu)["q_nb"].copy())
     late = attitude_error(ends[0], ends[1])
     assert np.degrees(np.abs(late[2200:] - late[2200]).max()) < 2e-3
+
+
+def test_runge_kutta_moves_the_rotor_too():
+    exact = instruments(scenario(), STEP).sense(0, 500)
+    source = instruments(scenario(rotor={"method": "rk4"}), STEP).sense(0, 500)
+    assert 0.0 < np.abs(exact.rotor - source.rotor).max() < 1e-4 * np.abs(exact.rotor).max()
