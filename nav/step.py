@@ -124,7 +124,14 @@ def push(address: int, step: float, x: float, y: float, z: float, vx: float, vy:
     steps[0] = step
     dtheta[0, 0], dtheta[0, 1], dtheta[0, 2] = x, y, z
     dvel[0, 0], dvel[0, 1], dvel[0, 2] = vx, vy, vz
-    code, field, window = int(head[CODE]), int(head[FIELD]), int(head[WINDOW])
-    out = position, velocity, attitude, azimuth
-    bias = head[BIAS:_MEMORY]
-    return advance(code, field, window, False, memory, state, bias, steps, dtheta, dvel, dq, dv, ds, *out)
+    code, field, bias = int(head[CODE]), int(head[FIELD]), head[BIAS:_MEMORY]
+    # As `advance`, without its calls: handing on a dozen arrays twice costs half a step.
+    if code == _SOURCE:
+        return cartesian.advance_source(state, field, steps, dtheta, dvel, bias, position, velocity, attitude)
+    integrate_body(memory, int(head[WINDOW]), steps, dtheta, dvel, bias, dq, dv, ds)
+    if code == _GEOGRAPHIC:
+        return geographic.advance(state, field, steps, dq, dv, ds, position, velocity, attitude)
+    if code == _WANDER:
+        return wander.advance(state, field, steps, dq, dv, ds, position, velocity, attitude, azimuth)
+    turn_rate = RATE if code == _EARTH else 0.0
+    return cartesian.advance(state, field, turn_rate, steps, dq, dv, ds, position, velocity, attitude)

@@ -6,7 +6,7 @@ mechanization answers in the same terms: geodetic position, velocity in n, q_nb.
 """
 
 from collections.abc import Callable
-from functools import partial
+from types import MethodType
 from typing import Any
 
 import numpy as np
@@ -274,7 +274,7 @@ class Strapdown:
         self.advance(np.array([step]), np.array([[x, y, z]]), np.array([[vx, vy, vz]]), np.zeros(3), *one)
         if self._lead is None and self._stream is None and not self._blocks:
             # The compiled function itself: numba's dispatcher costs as much as the step.
-            self.push = partial(_push.compile(kernels.PUSH), self._core.ctypes.data)
+            self.push = MethodType(_push.compile(kernels.PUSH), _Address(self._core))
         return kernels.DONE
 
     def _room(self, n: int) -> None:
@@ -289,6 +289,18 @@ class Strapdown:
         before = np.concatenate([self._q[None], rows[:-1]])
         turns_between(before, rows, self._dq[:n])
         self._q = rows[-1].copy()
+
+
+class _Address(int):
+    """Address of an array that keeps the array alive."""
+
+    def __new__(cls, array: FloatArray) -> "_Address":
+        """Of `array`."""
+        address = super().__new__(cls, array.ctypes.data)
+        address._array = array
+        return address
+
+    _array: FloatArray
 
 
 def _method(attitude: str) -> attitudes.AttitudeMethod:

@@ -1,5 +1,6 @@
 """Every mechanization against the same analytic flights, against each other, and where they differ: poles and azimuth."""
 
+import gc
 import math
 from itertools import pairwise
 
@@ -629,3 +630,19 @@ def test_what_is_not_a_number_never_enters(mechanization, value):
         navigator.process(record(dtheta, dvel, 0.01))
     dvel[7, 2] = dvel[6, 2]
     assert np.isfinite(navigator.process(record(dtheta, dvel, 0.01))["vel_n"]).all()
+
+
+def test_a_kept_push_outlives_its_core():
+    """It works on the core's memory by address: that memory stays while the function does."""
+    core, other = Strapdown(), Strapdown()
+    for each in core, other:
+        begin(each, MOTIONS["flight"].truth([0.0])[0])
+        each.push(0.01, 0.0, 0.0, 0.0, 0.0, 0.0, -0.098)
+    push, solution = core.push, core.solution
+    del core
+    gc.collect()
+    garbage = [np.full(400, np.nan) for _ in range(100)]
+    for each in push, other.push:
+        assert each(0.01, 1e-4, 0.0, 0.0, 0.0, 0.0, -0.098) == DONE
+    assert len(garbage) == 100
+    np.testing.assert_array_equal(solution, other.solution)
