@@ -23,7 +23,7 @@ from enum import IntFlag
 import numpy as np
 
 from nav.increments import FloatArray, IntArray
-from nav.kernel import kernel
+from nav.kernel import inline_kernel, kernel
 
 GYRO_AXES = ("g1x", "g1y", "g2y", "g2z")
 AXES = (*GYRO_AXES, "ax", "ay", "az")
@@ -137,7 +137,7 @@ def _begin(memory: FloatArray) -> None:
         memory[i] = 0.0
 
 
-@kernel
+@inline_kernel
 def _unchanged_for(memory: FloatArray, axis: int, value: float, t: float) -> float:
     """How long the axis has given the same increment, s."""
     base = axis * _AXIS
@@ -146,7 +146,7 @@ def _unchanged_for(memory: FloatArray, axis: int, value: float, t: float) -> flo
     return float(memory[base + _SAME])
 
 
-@kernel
+@inline_kernel
 def _add_noise(memory: FloatArray, axis: int, value: float, t: float) -> None:
     """Take an increment into the mean square of the sixth difference."""
     base = axis * _AXIS
