@@ -95,6 +95,8 @@ def advance(
 def push(address: int, step: float, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> int:
     """Take one sample into the core at `address`: `DONE`, or nothing changed and `POLE` or `NOT_FINITE`.
 
+    `NOT_FINITE` as well where an increment is so large that the solution is no number any more; only a start helps then.
+
     Parameters
     ----------
     address : int
@@ -127,4 +129,8 @@ def push(address: int, step: float, x: float, y: float, z: float, vx: float, vy:
     code, field, window = int(head[CODE]), int(head[FIELD]), int(head[WINDOW])
     out = position, velocity, attitude, azimuth
     bias = head[BIAS:_MEMORY]
-    return advance(code, field, window, False, memory, state, bias, steps, dtheta, dvel, dq, dv, ds, *out)
+    done = advance(code, field, window, False, memory, state, bias, steps, dtheta, dvel, dq, dv, ds, *out)
+    total = attitude[0, 3]
+    for i in range(3):
+        total += position[0, i] + velocity[0, i] + attitude[0, i]
+    return done if math.isfinite(total) else NOT_FINITE
