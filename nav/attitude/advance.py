@@ -152,8 +152,11 @@ def advance(
     Returns
     -------
     int
-        Rows of `out` filled.
+        Rows of `out` filled; -1 - k where sample k is not a number, and then nothing has changed.
     """
+    for k in range(step.shape[0]):
+        if not math.isfinite(step[k] + dtheta[k, 0] + dtheta[k, 1] + dtheta[k, 2]):
+            return -1 - k
     steps = state[_STEPS:_ANGLES]
     angles = state[_ANGLES:_ROWS].reshape((2 * MAX_SAMPLES, 3))
     rows = state[_ROWS:_WORK].reshape((MAX_SAMPLES, 4))
