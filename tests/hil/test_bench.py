@@ -30,6 +30,7 @@ def test_one_by_one_is_the_same_work():
     record, core = StrapdownRecord(50), Strapdown("high-order:4", "wander")
     record.by(core)
     whole = core.solution.copy()
+    core.start(*record.start)
     record.one_by_one(core, 50)
     np.testing.assert_array_equal(core.solution, whole)
 
