@@ -15,6 +15,8 @@ def read_array(what: str, values: ArrayLike, *shape: int) -> FloatArray:
     HilError
         It has another shape.
     """
+    if type(values) is np.ndarray and values.shape == shape and values.dtype == np.float64 and values.flags.carray:
+        return values
     array = np.ascontiguousarray(values, np.float64)
     if array.shape != shape:
         raise HilError(f"{what}: shape {array.shape} where {shape} is needed")
