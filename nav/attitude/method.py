@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from nav.attitude.advance import BLOCK_ENDS, EVERY_ROW, STREAM, advance, advance_rates, initial_state
-from nav.checks import check_room, read_array
+from nav.checks import read_array
 from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.rotation import normalised
@@ -147,7 +147,9 @@ class AttitudeStream:
         self._state = initial_state(method.kind, normalised(read_array("q0", q0, 4)))
 
     def push(self, step: FloatArray, dtheta: FloatArray, out: FloatArray) -> None:
-        """Integrate samples, allocating nothing where these are contiguous arrays of float64.
+        """Integrate samples, allocating nothing.
+
+        The arrays are contiguous, of float64: the kernel is compiled anew for any other kind.
 
         Parameters
         ----------
@@ -156,21 +158,22 @@ class AttitudeStream:
         dtheta : (n, 3) float
             Angle increments, rad.
         out : (n, 4) float
-            Out: q_ib at the end of each step; contiguous, float64.
+            Out: q_ib at the end of each step.
 
         Raises
         ------
         HilError
             A shape does not fit, or a value is not a number: nothing has changed. Or an increment is too large.
         """
-        m, n = self._method, len(step)
-        step, dtheta = read_array("step", step, n), read_array("dtheta", dtheta, n, 3)
-        check_room("out", out, n, 4)
-        _advance(m, STREAM, self._state, step, dtheta, out)
+        _advance(self._method, STREAM, self._state, step, dtheta, out)
 
 
 def _advance(m: Method, mode: int, state: FloatArray, step: FloatArray, dtheta: FloatArray, out: FloatArray) -> int:
     rows = int(advance(m.kind, m.window, m.block, m.table, mode, state, step, dtheta, out))
+    if rows == -1 - len(step):
+        raise HilError(
+            f"attitude: expected step (n,), dtheta (n, 3) and out (n, 4), got {step.shape}, {dtheta.shape} and {out.shape}"
+        )
     if rows < 0:
         raise HilError(f"attitude: step or dtheta of sample {-1 - rows} is not a number: mend the driver or the file")
     if rows and not math.isfinite(out[rows - 1, 0]):
