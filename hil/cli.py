@@ -236,8 +236,11 @@ def study(
     from hil.study import study as run_study
     from hil.study import study_names
 
+    chosen = study_names() if names == ["all"] else names
+    for name in set(chosen) - set(study_names()):
+        raise HilError(f"unknown study {name!r}; there is: all, {', '.join(study_names())}")
     failed = []
-    for name in study_names() if names == ["all"] else names:
+    for name in chosen:
         rows = run_study(name, out)
         failed += [f"{name}: {row['id']}" for row in rows if not row["ok"]]
         if as_json:

@@ -18,10 +18,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from nav.checks import read_array
 from nav.error_dynamics import STATES, fill_dynamics, fill_input, fill_transition
 from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
+from nav.rotation import normalised
 from nav.turn import matrix_from_quaternion
 
 
@@ -41,7 +43,7 @@ class Path:
     Raises
     ------
     HilError
-        A value is not finite, the step is not positive, or the path meets a pole.
+        A shape does not fit, a value is not finite, the step is not positive, or the path meets a pole.
     """
 
     step: float
@@ -56,11 +58,19 @@ class Path:
         """Refuse what would end in NaN."""
         if not 0.0 < self.step < np.inf:
             raise HilError(f"path: a step of {self.step:g} s; it must be positive")
-        for name in ("lat", "height", "vel_n", "q_nb", "w_ib_b", "f_b"):
-            array = np.ascontiguousarray(getattr(self, name), np.float64)
+        n = len(self.lat)
+        for name, tail in (
+            ("lat", ()),
+            ("height", ()),
+            ("vel_n", (3,)),
+            ("q_nb", (4,)),
+            ("w_ib_b", (3,)),
+            ("f_b", (3,)),
+        ):
+            array = read_array(f"path: {name}", getattr(self, name), n, *tail)
             if not np.isfinite(array).all():
                 raise HilError(f"path: {name} is not finite at step {int(np.argwhere(~np.isfinite(array))[0, 0])}")
-            object.__setattr__(self, name, array)
+            object.__setattr__(self, name, normalised(array) if name == "q_nb" else array)
         if not (np.abs(self.lat) < 0.5 * np.pi).all():
             raise HilError("path: it meets a pole, where north is no direction")
 
@@ -84,6 +94,11 @@ class Source:
         Of d sums of Gauss-Markov processes, independent and alike: S in b.
     times : (p,) float
         Correlation times of the processes in each sum, s.
+
+    Raises
+    ------
+    HilError
+        A shape does not fit, a value is not finite, or a correlation time is not positive.
     """
 
     name: str
@@ -91,6 +106,17 @@ class Source:
     white: FloatArray = field(default_factory=lambda: _none(6))
     drift: FloatArray = field(default_factory=lambda: _none(6))
     times: FloatArray = field(default_factory=_none)
+
+    def __post_init__(self) -> None:
+        """Refuse what would end in NaN."""
+        for name, tail in (("constant", (6, 7)), ("white", (6,)), ("drift", (6,)), ("times", ())):
+            values = getattr(self, name)
+            array = read_array(f"source {self.name!r}: {name}", values, len(values), *tail)
+            if not np.isfinite(array).all():
+                raise HilError(f"source {self.name!r}: {name} is not finite")
+            object.__setattr__(self, name, array)
+        if not (self.times > 0.0).all() or (len(self.drift) > 0 and len(self.times) == 0):
+            raise HilError(f"source {self.name!r}: a drift needs correlation times, and positive ones")
 
 
 def response(
@@ -115,11 +141,18 @@ def response(
     -------
     (n // every, m, 9) float
         At the end of each `every`th step.
+
+    Raises
+    ------
+    HilError
+        A shape does not fit, or `every` is below 1.
     """
-    if start.shape != (len(start), STATES) or constant.shape != (len(start), 6, 7):
-        raise ValueError(f"response: expected (m, 9) and (m, 6, 7) arrays, got {start.shape} and {constant.shape}")
+    m = len(start)
+    start, constant = read_array("start", start, m, STATES), read_array("constant", constant, m, 6, 7)
+    if every < 1:
+        raise HilError(f"response: an answer every {every} steps; it must be 1 or more")
     out = np.empty((len(path.lat) // every, len(start), STATES))
-    _respond(_table(path), path.step, height_held, every, np.array(start, float), np.ascontiguousarray(constant), out)
+    _respond(_table(path), path.step, height_held, every, start.copy(), constant, out)
     return out
 
 
@@ -128,7 +161,7 @@ def covariance(path: Path, source: Source, *, every: int = 1, height_held: bool 
     s = response(path, np.zeros((len(source.constant), STATES)), source.constant, every=every, height_held=height_held)
     out = np.einsum("kmi,kmj->kij", s, s)
     if len(source.white) or len(source.drift):
-        noise = np.ascontiguousarray(source.white), np.ascontiguousarray(source.drift), source.times
+        noise = source.white, source.drift, source.times
         _spread(_table(path), path.step, height_held, every, *noise, out)
     return np.asarray(out, np.float64)
 
@@ -136,8 +169,19 @@ def covariance(path: Path, source: Source, *, every: int = 1, height_held: bool 
 def budget(
     path: Path, sources: Iterable[Source], *, every: int = 1, height_held: bool = False
 ) -> dict[str, FloatArray]:
-    """`covariance` of each source by its name; their sum is the whole."""
-    return {s.name: covariance(path, s, every=every, height_held=height_held) for s in sources}
+    """`covariance` of each source by its name; their sum is the whole.
+
+    Raises
+    ------
+    HilError
+        Two sources have one name.
+    """
+    found: dict[str, FloatArray] = {}
+    for source in sources:
+        if source.name in found:
+            raise HilError(f"budget: two sources of one name, {source.name!r}: one would be lost")
+        found[source.name] = covariance(path, source, every=every, height_held=height_held)
+    return found
 
 
 def _table(path: Path) -> FloatArray:

@@ -2,6 +2,8 @@
 
 `normal`: the normal gravity of :mod:`nav.earth` less the centrifugal acceleration. `j2`: GM and J2. Both without the
 centrifugal part, for equations in frames that do not turn with the Earth.
+
+The height series of `normal` leaves out about 4 g (h/a)^3: 1.5e-4 m/s^2 at 100 km, 0.1 at 1000 km; take `j2` there.
 """
 
 import math

@@ -18,7 +18,8 @@ IntArray = NDArray[np.int64]
 
 
 @kernel
-def _first_bad(time: FloatArray, step: FloatArray, dtheta: FloatArray, dvel: FloatArray) -> int:
+def first_bad(time: FloatArray, step: FloatArray, dtheta: FloatArray, dvel: FloatArray) -> int:
+    """Row of the first sample that holds a value that is not finite; -1 when there is none."""
     for k in range(time.shape[0]):
         total = time[k] + step[k]
         for i in range(3):
@@ -74,7 +75,7 @@ class ImuIncrements:
 
     def first_bad(self) -> int:
         """Row of the first sample that holds a value that is not finite; -1 when there is none."""
-        return int(_first_bad(self.time, self.step, self.dtheta, self.dvel))
+        return int(first_bad(self.time, self.step, self.dtheta, self.dvel))
 
     def rows(self, start: int, stop: int) -> "ImuIncrements":
         """The samples `start` to `stop` as views."""

@@ -11,7 +11,9 @@ import math
 
 import numpy as np
 
+from nav.checks import read_array
 from nav.earth import curvature_radii
+from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.kernel import kernel
 
@@ -29,7 +31,13 @@ def azimuth_change(lat: FloatArray, lon: FloatArray) -> FloatArray:
     -------
     (n,) float
         rad, not reduced to a turn.
+
+    Raises
+    ------
+    HilError
+        There is no point, or one is not a number.
     """
+    lat, lon = _points(lat, lon)
     half_lon, half_lat, mid = 0.5 * np.diff(lon), 0.5 * np.diff(lat), 0.5 * (lat[1:] + lat[:-1])
     half_lon = half_lon - np.pi * np.round(half_lon / np.pi)
     each = 2.0 * np.arctan2(np.sin(half_lon) * np.sin(mid), np.cos(half_lon) * np.cos(half_lat))
@@ -48,7 +56,13 @@ def solid_angle(lat: FloatArray, lon: FloatArray) -> float:
     -------
     float
         Steradians: triangles from the first point, by their triple products (Van Oosterom & Strackee 1983).
+
+    Raises
+    ------
+    HilError
+        There is no point, or one is not a number.
     """
+    lat, lon = _points(lat, lon)
     up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
     a, b, c = up[0], up[1:-1], up[2:]
     # Differences from the first point: narrow triangles lose nothing to rounding.
@@ -79,7 +93,6 @@ def family(azimuth: float, gyro_heading: float, vel_w: FloatArray, constant: flo
     return azimuth + constant, gyro_heading - constant, turned
 
 
-@kernel
 def constant_gyro_heading(lat: float, lon: float, heading: float, length: float, count: int) -> FloatArray:
     """Path on the ellipsoid with a constant gyroscopic heading: a geodesic, found without using that it is one.
 
@@ -90,13 +103,28 @@ def constant_gyro_heading(lat: float, lon: float, heading: float, length: float,
     length : float
         m.
     count : int
-        Steps (Runge-Kutta 4 of B', L', A' by the length). The path must keep away from the poles.
+        Steps (Runge-Kutta 4 of B', L', A' by the length), 1 or more. The path must keep away from the poles.
 
     Returns
     -------
     (count + 1, 3) float
         lat, lon, A.
+
+    Raises
+    ------
+    HilError
+        A value is not a number, there is no step, or the path meets a pole.
     """
+    if not np.isfinite([lat, lon, heading, length]).all() or count < 1:
+        raise HilError(f"path of constant gyroscopic heading: {lat}, {lon}, {heading}, {length} m in {count} steps")
+    path = _constant_gyro_heading(float(lat), float(lon), float(heading), float(length), count)
+    if not (np.abs(path[:, 0]) < 0.5 * np.pi).all():
+        raise HilError("path of constant gyroscopic heading: it meets a pole; shorten it")
+    return path
+
+
+@kernel
+def _constant_gyro_heading(lat: float, lon: float, heading: float, length: float, count: int) -> FloatArray:
     out = np.empty((count + 1, 3))
     out[0, 0], out[0, 1], out[0, 2] = lat, lon, 0.0
     h = length / count
@@ -114,3 +142,11 @@ def constant_gyro_heading(lat: float, lon: float, heading: float, length: float,
         for j in range(3):
             out[k + 1, j] = out[k, j] + h / 6.0 * (slopes[0, j] + 2.0 * (slopes[1, j] + slopes[2, j]) + slopes[3, j])
     return out
+
+
+def _points(lat: FloatArray, lon: FloatArray) -> tuple[FloatArray, FloatArray]:
+    n = len(lat)
+    points = read_array("path: lat", lat, n), read_array("path: lon", lon, n)
+    if n == 0 or not np.isfinite(points).all():
+        raise HilError("path: it has no points, or one is not a number")
+    return points

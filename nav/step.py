@@ -95,6 +95,8 @@ def advance(
 def push(address: int, step: float, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> int:
     """Take one sample into the core at `address`: `DONE`, or nothing changed and `POLE` or `NOT_FINITE`.
 
+    `NOT_FINITE` as well where an increment is so large that the solution is no number any more; only a start helps then.
+
     Parameters
     ----------
     address : int
@@ -125,13 +127,20 @@ def push(address: int, step: float, x: float, y: float, z: float, vx: float, vy:
     dtheta[0, 0], dtheta[0, 1], dtheta[0, 2] = x, y, z
     dvel[0, 0], dvel[0, 1], dvel[0, 2] = vx, vy, vz
     code, field, bias = int(head[CODE]), int(head[FIELD]), head[BIAS:_MEMORY]
+    body = dq, dv, ds
+    out = position, velocity, attitude
     # As `advance`, without its calls: handing on a dozen arrays twice costs half a step.
     if code == _SOURCE:
-        return cartesian.advance_source(state, field, steps, dtheta, dvel, bias, position, velocity, attitude)
-    integrate_body(memory, int(head[WINDOW]), steps, dtheta, dvel, bias, dq, dv, ds)
-    if code == _GEOGRAPHIC:
-        return geographic.advance(state, field, steps, dq, dv, ds, position, velocity, attitude)
-    if code == _WANDER:
-        return wander.advance(state, field, steps, dq, dv, ds, position, velocity, attitude, azimuth)
-    turn_rate = RATE if code == _EARTH else 0.0
-    return cartesian.advance(state, field, turn_rate, steps, dq, dv, ds, position, velocity, attitude)
+        done = cartesian.advance_source(state, field, steps, dtheta, dvel, bias, position, velocity, attitude)
+    else:
+        integrate_body(memory, int(head[WINDOW]), steps, dtheta, dvel, bias, dq, dv, ds)
+        if code == _GEOGRAPHIC:
+            done = geographic.advance(state, field, steps, *body, *out)
+        elif code == _WANDER:
+            done = wander.advance(state, field, steps, *body, *out, azimuth)
+        else:
+            done = cartesian.advance(state, field, RATE if code == _EARTH else 0.0, steps, *body, *out)
+    total = attitude[0, 3]
+    for i in range(3):
+        total += position[0, i] + velocity[0, i] + attitude[0, i]
+    return done if math.isfinite(total) else NOT_FINITE

@@ -5,6 +5,8 @@ and `high-order` the rotation comes from that method and the velocity and positi
 mechanization answers in the same terms: geodetic position, velocity in n, q_nb.
 """
 
+import copy
+import math
 from collections.abc import Callable
 from types import MethodType
 from typing import Any
@@ -14,11 +16,13 @@ import numpy as np
 from nav import attitude as attitudes
 from nav import step as kernels
 from nav.body_integrals import MAX_WINDOW, integrate_blocks, integrate_body
+from nav.checks import check_room, read_array
 from nav.earth import RATE
 from nav.errors import HilError
 from nav.gravitation import field_code
-from nav.increments import FloatArray
+from nav.increments import FloatArray, first_bad
 from nav.mechanization import cartesian, geographic, wander
+from nav.rotation import normalised
 from nav.turn import turns_between
 
 MECHANIZATIONS = kernels.MECHANIZATIONS
@@ -62,7 +66,7 @@ class Strapdown:
         One sample: ``push(step, dtheta_x, dtheta_y, dtheta_z, dvel_x, dvel_y, dvel_z)`` with the gyro bias taken off; see
         :func:`nav.step.push`. Its answer is `nav.step.DONE`, or ``POLE`` (`hand_over`, then push again) or ``NOT_FINITE``,
         and then nothing has changed. Compiled from the moment that the polynomials have all their samples; fetch it anew
-        after `start`.
+        after `start`. For `whole_record` there is none.
 
     Raises
     ------
@@ -89,11 +93,26 @@ class Strapdown:
         self._blocks = whole_record and self._window > 2
         self._core = np.zeros(kernels.CORE)
         self._core[kernels.FIELD], self._core[kernels.WINDOW] = self._field, self._window
+        self._look()
+        self._room(256)
+        self.start(0.0, 0.0, 0.0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def _look(self) -> None:
+        """Look into the core."""
         self._memory, self._state = self._core[kernels.MEMORY_PART], self._core[kernels.STATE_PART]
         self.solution = self._core[kernels.SOLUTION_PART][:10]
         self._azimuth = self._core[kernels.SOLUTION_PART][10:]
-        self._room(256)
-        self.start(0.0, 0.0, 0.0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        self.push: Callable[[float, float, float, float, float, float, float], int] = self._push_first
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What copies and pickles are made of: all but the ways into the core."""
+        ways = "_memory", "_state", "solution", "_azimuth", "push"
+        return {name: value for name, value in self.__dict__.items() if name not in ways}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Go on with a core of one's own."""
+        self.__dict__.update(copy.deepcopy(state))
+        self._look()
 
     @property
     def azimuth(self) -> float:
@@ -106,8 +125,19 @@ class Strapdown:
         """Begin at a position (rad, m) with a velocity (3,), m/s, and an attitude (4,), and no increments before.
 
         `azimuth` is that of the wander mechanization at the start, rad.
+
+        Raises
+        ------
+        HilError
+            A value is not finite, the latitude is beyond a pole, or the attitude is no rotation.
         """
-        self.solution[:] = lat, lon, height, *vel_n, *q_nb
+        place = read_array("start: lat, lon, height, vel_n, q_nb", [lat, lon, height, *vel_n, *q_nb], 10)
+        if not np.isfinite([*place, azimuth]).all():
+            raise HilError(f"start: a value is not a number: {place.tolist()}, azimuth {azimuth}")
+        if abs(lat) > 0.5 * np.pi:
+            raise HilError(f"start: latitude {np.degrees(lat):g} deg lies beyond a pole")
+        place[6:] = normalised(place[6:])
+        self.solution[:] = place
         self._settle(self._first, azimuth)
         self._memory[:] = 0.0
         self._q = np.array([1.0, 0.0, 0.0, 0.0])
@@ -115,7 +145,7 @@ class Strapdown:
         young = self._window > 2 and not self._blocks
         self._lead: list[FloatArray] | None = [] if young else None
         self._origin = self._state.copy()
-        self.push: Callable[[float, float, float, float, float, float, float], int] = self._push_first
+        self.push = self._push_first
 
     def hand_over(self, mechanization: str, azimuth: float = 0.0) -> None:
         """Go on in another mechanization, from the present solution and with the increments before.
@@ -176,20 +206,30 @@ class Strapdown:
         Parameters
         ----------
         step : (n,) float
-            s; a step of zero changes nothing.
+            s; a step of zero or less changes nothing.
         dtheta, dvel : (n, 3) float
             Increments, rad and m/s, body axes.
         gyro_bias : (3,) float
             Taken off the rates, rad/s.
         position, velocity, attitude : (n, 3), (n, 3), (n, 4) float
-            Out: lat, lon (rad), height (m); vel_n (m/s); q_nb, at the end of each step.
+            Out: lat, lon (rad), height (m); vel_n (m/s); q_nb, at the end of each step. Contiguous, float64.
 
         Raises
         ------
         HilError
-            The answer is not a finite number: an increment was none.
+            A shape does not fit, or an increment is not a number: nothing has changed. Or one was so large that the answer
+            is not a number: `start` again.
         """
         n = alone = len(step)
+        step, gyro_bias = read_array("step", step, n), read_array("gyro_bias", gyro_bias, 3)
+        dtheta, dvel = read_array("dtheta", dtheta, n, 3), read_array("dvel", dvel, n, 3)
+        check_room("position", position, n, 3)
+        check_room("velocity", velocity, n, 3)
+        check_room("attitude", attitude, n, 4)
+        bad = first_bad(step, step, dtheta, dvel)
+        if bad >= 0 or not math.isfinite(gyro_bias[0] + gyro_bias[1] + gyro_bias[2]):
+            what = "the gyro bias" if bad < 0 else f"increment {bad} of the batch"
+            raise HilError(f"strapdown: {what} is not a number: mend the driver or the file")
         if n > len(self._dq):
             self._room(2 * n)
         out = position, velocity, attitude
@@ -206,7 +246,7 @@ class Strapdown:
             alone = min(alone, done + self._advance(step[done:], dtheta[done:], dvel[done:], gyro_bias, there))
         if n and not np.isfinite(self.solution).all():
             bad = int(np.flatnonzero(~np.isfinite(np.hstack(out)).all(axis=1))[0])
-            raise HilError(f"strapdown: increment {bad} of the batch is not a number, or too large to be one")
+            raise HilError(f"strapdown: increment {bad} of the batch is too large to be one: start again without it")
         return alone
 
     def _advance(
@@ -215,7 +255,7 @@ class Strapdown:
         n = len(step)
         body = self._dq[:n], self._dv[:n], self._ds[:n]
         code, azimuths = MECHANIZATIONS.index(self.mechanization), self._azimuths[:n]
-        if self._stream is None and (step.all() or not self._blocks):
+        if self._stream is None and (not self._blocks or (step > 0.0).all()):
             how = code, self._field, self._window, self._blocks
             work = self._memory, self._state, gyro_bias
             done = int(kernels.advance(*how, *work, step, dtheta, dvel, *body, *out, azimuths))
@@ -268,11 +308,13 @@ class Strapdown:
 
     def _push_first(self, step: float, x: float, y: float, z: float, vx: float, vy: float, vz: float) -> int:
         """Take a sample as `advance` does, until all that the compiled function needs is there."""
+        if self._blocks:
+            raise HilError("push: a core for a whole record takes it by advance; make one without whole_record")
         if not np.isfinite(step + x + y + z + vx + vy + vz):
             return kernels.NOT_FINITE
         one = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 4))
         self.advance(np.array([step]), np.array([[x, y, z]]), np.array([[vx, vy, vz]]), np.zeros(3), *one)
-        if self._lead is None and self._stream is None and not self._blocks:
+        if self._lead is None and self._stream is None:
             # The compiled function itself: numba's dispatcher costs as much as the step.
             self.push = MethodType(_push.compile(kernels.PUSH), _Address(self._core))
         return kernels.DONE

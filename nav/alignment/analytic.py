@@ -129,7 +129,7 @@ def gyrocompass(
     form : Form
         One of `FORMS`.
     asked : float
-        Standard deviation of the heading that is needed, rad.
+        Standard deviation of the heading that is needed, rad; positive.
 
     Raises
     ------
@@ -148,12 +148,12 @@ def gyrocompass(
     noise = noise_f**2 * by_force @ by_force.T + noise_w**2 * by_rate @ by_rate.T
     bias = sensors.accelerometer_bias**2 * by_force @ by_force.T + sensors.gyro_bias**2 * by_rate @ by_rate.T
     result = Alignment(q_nb, np.zeros(3), noise + bias)
-    if result.sigma_heading > asked:
+    if not result.sigma_heading <= asked:
         text = (
             f"heading is known to {math.degrees(result.sigma_heading):.3g} deg, {math.degrees(asked):.3g} deg are asked"
         )
         left = asked**2 - bias[2, 2]
-        if left <= 0.0:
+        if not (asked > 0.0 and left > 0.0):
             limit = math.degrees(math.sqrt(bias[2, 2]))
             raise AlignmentRefused(f"no averaging is long enough: {text}, and the biases alone leave {limit:.3g} deg")
         needed = mean.time_s * noise[2, 2] / left
@@ -218,8 +218,10 @@ def _noise(mean: Means, sensors: Sensors) -> tuple[float, float]:
 
 
 def _check(mean: Means, sensors: Sensors, *more: float) -> None:
-    if not np.isfinite([*mean.f, *mean.w, mean.sigma_f, mean.sigma_w, *more]).all():
+    if not np.isfinite([*mean.f, *mean.w, mean.sigma_f, mean.sigma_w, mean.time_s, *more]).all():
         raise AlignmentRefused("a mean rate, a mean specific force or the latitude is not a number: mend the data")
+    if mean.time_s <= 0.0:
+        raise AlignmentRefused(f"averages over {mean.time_s:g} s say nothing: stand still for some seconds")
     wrong = gravity_verdict(mean.f)
     if wrong:
         raise AlignmentRefused(wrong)

@@ -4,10 +4,11 @@ The sums run sample by sample, so that the result does not depend on how samples
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
+from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.kernel import kernel
 
@@ -89,12 +90,22 @@ class Sensors:
         White noise of rate and specific force, rad/sqrt(s) and m/s/sqrt(s). Not stated, it is the scatter of the blocks.
     gyro_bias, accelerometer_bias : float
         rad/s and m/s^2.
+
+    Raises
+    ------
+    HilError
+        A value is negative or not finite.
     """
 
     angle_random_walk: float = 0.0
     velocity_random_walk: float = 0.0
     gyro_bias: float = 0.0
     accelerometer_bias: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what would end in NaN."""
+        if not all(0.0 <= getattr(self, one.name) < math.inf for one in fields(self)):
+            raise HilError(f"{self}: a standard deviation is 0 or more, and finite")
 
 
 UNSTATED = Sensors()

@@ -152,8 +152,14 @@ def advance(
     Returns
     -------
     int
-        Rows of `out` filled.
+        Rows of `out` filled; -1 - k where sample k is not a number, -1 - n where a shape does not fit: then nothing has
+        changed.
     """
+    if dtheta.shape != (step.shape[0], 3) or out.shape[1] != 4 or (mode != BLOCK_ENDS and len(out) != len(step)):
+        return -1 - len(step)
+    for k in range(step.shape[0]):
+        if not math.isfinite(step[k] + dtheta[k, 0] + dtheta[k, 1] + dtheta[k, 2]):
+            return -1 - k
     steps = state[_STEPS:_ANGLES]
     angles = state[_ANGLES:_ROWS].reshape((2 * MAX_SAMPLES, 3))
     rows = state[_ROWS:_WORK].reshape((MAX_SAMPLES, 4))

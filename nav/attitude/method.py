@@ -1,13 +1,16 @@
 """An attitude method as an object: whole records at once, or samples as they come."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from nav.attitude.advance import BLOCK_ENDS, EVERY_ROW, STREAM, advance, advance_rates, initial_state
+from nav.checks import read_array
 from nav.errors import HilError
 from nav.increments import FloatArray
+from nav.rotation import normalised
 
 _NO_TABLE: FloatArray = np.zeros(0)
 
@@ -48,9 +51,9 @@ class Method:
         Parameters
         ----------
         q0 : (4,) float
-            Attitude q_ib at the start, of unit norm.
+            Attitude q_ib at the start; normalised.
         step : (n,) float
-            Steps, s. A step of zero repeats the row before it.
+            Steps, s. A step of zero or less repeats the row before it.
         dtheta : (n, 3) float
             Angle increments, rad.
 
@@ -62,12 +65,12 @@ class Method:
         Raises
         ------
         HilError
-            The shapes do not fit.
+            The shapes do not fit, or a value is not a number.
         """
         q0, step, dtheta = _arrays(q0, step, dtheta, 0)
         out = np.empty((len(step), 4))
         state = initial_state(self.kind, q0)
-        advance(self.kind, self.window, self.block, self.table, EVERY_ROW, state, step, dtheta, out)
+        _advance(self, EVERY_ROW, state, step, dtheta, out)
         return out
 
     def block_ends(self, q0: FloatArray, step: FloatArray, dtheta: FloatArray) -> FloatArray:
@@ -77,8 +80,7 @@ class Method:
         q0, step, dtheta = _arrays(q0, step, dtheta, 0)
         out = np.empty((len(step) // self.block, 4))
         state = initial_state(self.kind, q0)
-        n = advance(self.kind, self.window, self.block, self.table, BLOCK_ENDS, state, step, dtheta, out)
-        return out[:n]
+        return out[: _advance(self, BLOCK_ENDS, state, step, dtheta, out)]
 
     def integrate_rates(self, q0: FloatArray, step: FloatArray, rate: FloatArray) -> FloatArray:
         """Attitudes after each step from sampled body rates, for methods that need rates.
@@ -86,7 +88,7 @@ class Method:
         Parameters
         ----------
         q0 : (4,) float
-            Attitude q_ib at the start, of unit norm.
+            Attitude q_ib at the start; normalised.
         step : (n,) float
             Steps, s, all positive.
         rate : (n + 1, 3) float
@@ -100,20 +102,25 @@ class Method:
         Raises
         ------
         HilError
-            The method takes increments, the shapes do not fit, or a step is not positive.
+            The method takes increments, the shapes do not fit, a value is not a number, or a step is not positive.
         """
         if self.needs != "rates":
             raise HilError(f"{self.name} takes increments, not rates; poisson-rk4 and euler-vector-rk4 take rates")
         q0, step, rate = _arrays(q0, step, rate, 1)
-        if not (step > 0.0).all():
-            raise HilError(f"step: expected positive steps, got {step[~(step > 0.0)][0]} s")
+        positive = (step > 0.0) & (step < np.inf)
+        if not positive.all():
+            raise HilError(f"step: expected positive steps, got {step[~positive][0]} s")
+        if not np.isfinite(rate).all():
+            raise HilError(
+                f"rate: row {int(np.argwhere(~np.isfinite(rate))[0, 0])} is not a number: mend what measured it"
+            )
         out = np.empty((len(step), 4))
         advance_rates(self.kind, initial_state(self.kind, q0), step, rate, out)
         return out
 
     def stream(self, q0: FloatArray) -> "AttitudeStream":
-        """The method for samples as they come, from the unit attitude `q0` (4,)."""
-        return AttitudeStream(self, np.asarray(q0, dtype=np.float64))
+        """The method for samples as they come, from the attitude `q0` (4,)."""
+        return AttitudeStream(self, q0)
 
 
 class AttitudeStream:
@@ -127,34 +134,54 @@ class AttitudeStream:
     method : Method
         The method.
     q0 : (4,) float
-        Attitude q_ib at the start, of unit norm.
+        Attitude q_ib at the start; normalised.
+
+    Raises
+    ------
+    HilError
+        `q0` is no rotation.
     """
 
     def __init__(self, method: Method, q0: FloatArray) -> None:
         self._method = method
-        self._state = initial_state(method.kind, q0)
+        self._state = initial_state(method.kind, normalised(read_array("q0", q0, 4)))
 
     def push(self, step: FloatArray, dtheta: FloatArray, out: FloatArray) -> None:
         """Integrate samples, allocating nothing.
 
+        The arrays are contiguous, of float64: the kernel is compiled anew for any other kind.
+
         Parameters
         ----------
         step : (n,) float
-            Steps, s; one of zero repeats the row before.
+            Steps, s; one of zero or less repeats the row before.
         dtheta : (n, 3) float
             Angle increments, rad.
         out : (n, 4) float
             Out: q_ib at the end of each step.
+
+        Raises
+        ------
+        HilError
+            A shape does not fit, or a value is not a number: nothing has changed. Or an increment is too large.
         """
-        m = self._method
-        advance(m.kind, m.window, m.block, m.table, STREAM, self._state, step, dtheta, out)
+        _advance(self._method, STREAM, self._state, step, dtheta, out)
+
+
+def _advance(m: Method, mode: int, state: FloatArray, step: FloatArray, dtheta: FloatArray, out: FloatArray) -> int:
+    rows = int(advance(m.kind, m.window, m.block, m.table, mode, state, step, dtheta, out))
+    if rows == -1 - len(step):
+        raise HilError(
+            f"attitude: expected step (n,), dtheta (n, 3) and out (n, 4), got {step.shape}, {dtheta.shape} and {out.shape}"
+        )
+    if rows < 0:
+        raise HilError(f"attitude: step or dtheta of sample {-1 - rows} is not a number: mend the driver or the file")
+    if rows and not math.isfinite(out[rows - 1, 0]):
+        raise HilError("attitude: an increment is too large for the attitude to be a number: start again without it")
+    return rows
 
 
 def _arrays(q0: FloatArray, step: FloatArray, rows: FloatArray, more: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    q0, step, rows = (np.ascontiguousarray(a, dtype=np.float64) for a in (q0, step, rows))
-    if q0.shape != (4,) or step.ndim != 1 or rows.shape != (len(step) + more, 3):
-        raise HilError(
-            f"attitude: expected q0 (4,), step (n,) and {'rates (n + 1, 3)' if more else 'dtheta (n, 3)'}, "
-            f"got {q0.shape}, {step.shape} and {rows.shape}"
-        )
-    return q0, step, rows
+    what, n = "rate" if more else "dtheta", len(step)
+    q0, step, rows = read_array("q0", q0, 4), read_array("step", step, n), read_array(what, rows, n + more, 3)
+    return normalised(q0), step, rows

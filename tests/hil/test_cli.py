@@ -322,3 +322,9 @@ def test_stop_signal_ends_with_the_summary(number: int) -> None:
         out, err = process.communicate(timeout=30)
     assert process.returncode == 0, err
     assert json.loads(out)["samples"] > 0
+
+
+def test_an_unknown_study_is_refused_before_the_first_runs(hil: Cli) -> None:
+    code, out, err = hil("study", "orientation", "nonsense")
+    assert (code, out) == (2, "")
+    assert "unknown study 'nonsense'; there is: all, orientation" in err

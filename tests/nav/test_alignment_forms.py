@@ -1,5 +1,6 @@
 """The source's three forms of analytic alignment, and the covariance of what they find."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,6 +13,7 @@ from nav.alignment import rest
 from nav.alignment.analytic import FORMS, AlignmentRefused, gyrocompass, level
 from nav.alignment.rest import Sensors
 from nav.earth import normal_gravity
+from nav.errors import HilError
 from nav.rotation import attitude_error
 
 EARTH_RATE = 7.292115e-5
@@ -136,3 +138,24 @@ def test_covariance_of_the_level_alignment_is_that_of_the_numerical_derivatives(
     found = level(averaged(f, w, 0.8 * sigma_f), lat, heading, sigma_heading, Sensors(accelerometer_bias=0.6 * sigma_f))
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found.covariance / scale, expected / scale, atol=1e-6)
+
+
+@pytest.mark.parametrize("wrong", [{"time_s": 0.0}, {"time_s": -1.0}, {"time_s": math.nan}])
+def test_no_time_is_no_average(wrong):
+    mean = dataclasses.replace(averaged(*at_rest(Rotation.identity(), 0.9)), **wrong)
+    for align in (lambda: gyrocompass(mean, 0.9), lambda: level(mean, 0.9, 0.0)):
+        with pytest.raises(AlignmentRefused):
+            align()
+
+
+@pytest.mark.parametrize("asked", [math.nan, -1.0])
+def test_a_heading_of_no_accuracy_is_never_good_enough(asked):
+    mean = averaged(*at_rest(Rotation.identity(), 0.9), sigma_w=1e-7)
+    with pytest.raises(AlignmentRefused, match="no averaging is long enough"):
+        gyrocompass(mean, 0.9, asked=asked)
+
+
+@pytest.mark.parametrize("value", [math.nan, -1e-6, math.inf])
+def test_a_sensor_has_finite_deviations(value):
+    with pytest.raises(HilError, match="0 or more"):
+        Sensors(gyro_bias=value)

@@ -239,11 +239,43 @@ def test_names():
 
 def test_wrong_calls_are_refused():
     q0 = np.array([1.0, 0.0, 0.0, 0.0])
-    with pytest.raises(HilError, match=r"dtheta \(n, 3\)"):
+    with pytest.raises(HilError, match=r"dtheta: shape \(4, 3\) where \(3, 3\)"):
         method("picard3").integrate(q0, np.ones(3), np.ones((4, 3)))
     with pytest.raises(HilError, match="takes increments"):
         method("picard3").integrate_rates(q0, np.ones(3), np.ones((4, 3)))
-    with pytest.raises(HilError, match=r"rates \(n \+ 1, 3\)"):
+    with pytest.raises(HilError, match=r"rate: shape \(3, 3\) where \(4, 3\)"):
         method("poisson-rk4").integrate_rates(q0, np.ones(3), np.ones((3, 3)))
-    with pytest.raises(HilError, match="positive"):
-        method("poisson-rk4").integrate_rates(q0, np.zeros(3), np.ones((4, 3)))
+    for step in 0.0, math.inf:
+        with pytest.raises(HilError, match="positive"):
+            method("poisson-rk4").integrate_rates(q0, np.full(3, step), np.ones((4, 3)))
+    with pytest.raises(HilError, match="rate: row 2 is not a number"):
+        method("poisson-rk4").integrate_rates(
+            q0, np.ones(3), np.array([[0, 0, 0], [0, 0, 0], [0, math.nan, 0], [0, 0, 0]])
+        )
+    with pytest.raises(HilError, match="no rotation"):
+        method("picard3").stream(np.zeros(4))
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_no_stream_reads_or_writes_beyond_its_arrays_or_takes_what_is_no_number(name):
+    times = 0.01 * np.arange(31)
+    step, dtheta = np.diff(times), MOTION.increments(times)
+    chosen, room = method(name), np.zeros((30, 4))
+    stream, wrong = chosen.stream(MOTION.attitude(0.0)), dtheta.copy()
+    wrong[7, 2] = math.nan
+    for arrays, say in (
+        ((step, dtheta[:3], room), r"got \(30,\), \(3, 3\)"),
+        ((step, np.ascontiguousarray(dtheta[:, :2]), room), r"got \(30,\), \(30, 2\)"),
+        ((step, dtheta, room[:3]), r"and \(3, 4\)"),
+        ((step, wrong, room), "sample 7 is not a number"),
+    ):
+        with pytest.raises(HilError, match=say):
+            stream.push(*arrays)
+    with pytest.raises(HilError, match="sample 7 is not a number"):
+        chosen.integrate(MOTION.attitude(0.0), step, wrong)
+    stream.push(step, dtheta, room)  # and nothing has changed
+    again = np.empty((30, 4))
+    chosen.stream(3.0 * MOTION.attitude(0.0)).push(step, dtheta, again)
+    np.testing.assert_allclose(room, again, atol=1e-15)
+    with pytest.raises(HilError, match="too large"):
+        stream.push(step, np.full((30, 3), 1e200), room)

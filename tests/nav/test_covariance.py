@@ -17,7 +17,7 @@ from nav.instruments.accelerometer_errors import Accelerometers
 from nav.instruments.channels import TRIAD
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import DTG_HEAD, Gyros
-from nav.instruments.head import HeadCombiner
+from nav.instruments.head import HeadCombiner, HeadModel
 from nav.instruments.noise import Noise, NoiseModel, flicker_processes
 from nav.instruments.sources import combination, grade_sources
 from nav.strapdown import Strapdown
@@ -169,10 +169,11 @@ def test_sources_are_what_the_grade_draws(name, removed):
 
 def test_channels_are_combined_as_the_head_does():
     rng = np.random.default_rng(3)
-    dtheta, zeros = rng.standard_normal((5, 4)), np.zeros((5, 3))
-    index = np.arange(5)
-    head = HeadIncrements(0.01 * index, np.full(5, 0.01), dtheta, np.full((5, 4), np.nan), zeros, index, index)
-    np.testing.assert_allclose(dtheta @ combination(DTG_HEAD).T, HeadCombiner(np.eye(3)).combine(head).dtheta)
+    dtheta, head = 1e-9 * rng.standard_normal((5, 4)), HeadIncrements.empty(5)
+    head.step[:], head.dtheta[:] = 0.01, dtheta
+    np.testing.assert_allclose(
+        dtheta @ combination(DTG_HEAD).T, HeadCombiner(HeadModel(np.eye(3))).combine(head).dtheta, atol=1e-20
+    )
     np.testing.assert_allclose(combination(TRIAD), np.eye(3), atol=1e-15)
 
 
@@ -182,8 +183,36 @@ def test_channels_are_combined_as_the_head_does():
         ({"step": 0.0}, "it must be positive"),
         ({"lat": np.array([0.1, 0.5 * math.pi])}, "meets a pole"),
         ({"f_b": np.array([[0, 0, -9.8], [0, np.nan, 0]])}, "f_b is not finite at step 1"),
+        ({"height": np.zeros(1)}, "path: height: shape"),
+        ({"vel_n": np.zeros((2, 2))}, "path: vel_n: shape"),
+        ({"q_nb": np.zeros((2, 4))}, "no rotation"),
     ],
 )
 def test_impossible_paths_are_refused(change, say):
     with pytest.raises(HilError, match=say):
         dataclasses.replace(rest(1.0, 2), **change)
+
+
+@pytest.mark.parametrize(
+    ("source", "say"),
+    [
+        ({"white": np.ones((1, 3))}, "white: shape"),
+        ({"white": np.full((1, 6), np.nan)}, "white is not finite"),
+        ({"constant": np.ones((1, 6, 6))}, "constant: shape"),
+        ({"drift": np.ones((1, 6))}, "needs correlation times"),
+        ({"drift": np.ones((1, 6)), "times": np.zeros(1)}, "positive ones"),
+    ],
+)
+def test_impossible_sources_are_refused(source, say):
+    with pytest.raises(HilError, match=say):
+        Source("wrong", **source)
+
+
+def test_an_attitude_of_any_norm_is_the_same_rotation():
+    path, source = rest(1.0, 20), Source("white", white=np.ones((1, 6)))
+    longer = dataclasses.replace(path, q_nb=2.0 * path.q_nb)
+    np.testing.assert_allclose(covariance(longer, source), covariance(path, source), rtol=1e-14)
+    with pytest.raises(HilError, match="every 0 steps"):
+        covariance(path, source, every=0)
+    with pytest.raises(HilError, match="sources of one name"):
+        budget(path, [source, source])

@@ -10,8 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from hil.geometry import position_error
-from hil.study.navigation import flight
-from hil.world.motion import Motion
+from hil.study.navigation.flights import flight
 from nav.covariance import Path, response
 from nav.earth import RATE, curvature_radii, normal_gravity
 from nav.error_dynamics import fill_dynamics, fill_input, fill_transition
@@ -66,7 +65,7 @@ def worst(found, predicted):
 @pytest.mark.parametrize("name", ["smooth", "agile"])
 def test_the_navigator_errs_as_predicted(name):
     """Ten minutes of flight; both signs of each error, so that the second order falls out."""
-    motion, step, seconds = Motion(flight(name)), 0.02, 600
+    motion, step, seconds = flight(name), 0.02, 600
     n, every = round(seconds / step), round(1.0 / step)
     dtheta, dvel = np.empty((n, 3)), np.empty((n, 3))
     motion.increments(0, n, step, dtheta, dvel)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from hil.scenario import load
 from hil.world.motion import Motion
+from nav.errors import HilError
 from nav.nonholonomy import azimuth_change, constant_gyro_heading, family, solid_angle
 from nav.strapdown import Strapdown
 
@@ -88,3 +89,26 @@ def test_the_mechanization_follows_its_path_and_knows_the_family():
     assert azimuth == pytest.approx(azimuth_change(path[:, 0], path[:, 1])[-1], abs=1e-11)
     assert other - azimuth == pytest.approx(2.0, abs=1e-12)
     assert np.abs(other_position - position).max() < 1e-6
+
+
+@pytest.mark.parametrize("what", [azimuth_change, solid_angle])
+@pytest.mark.parametrize(
+    ("lat", "lon", "say"),
+    [([], [], "no points"), ([0.1, math.nan], [0.0, 1.0], "not a number"), ([0.1, 0.2], [0.0], "lon: shape")],
+)
+def test_what_is_no_path_is_refused(what, lat, lon, say):
+    with pytest.raises(HilError, match=say):
+        what(lat, lon)
+
+
+@pytest.mark.parametrize(
+    ("start", "say"),
+    [
+        ((0.9, 0.0, 0.0, 1e7, 1000), "meets a pole"),
+        ((math.nan, 0.0, 0.0, 1e3, 2), "nan"),
+        ((0.9, 0.0, 0.0, 1e3, 0), "0 steps"),
+    ],
+)
+def test_a_geodesic_that_cannot_be_followed_is_refused(start, say):
+    with pytest.raises(HilError, match=say):
+        constant_gyro_heading(*start)

@@ -1,7 +1,9 @@
 """Every mechanization against the same analytic flights, against each other, and where they differ: poles and azimuth."""
 
+import copy
 import gc
 import math
+import pickle
 import weakref
 from itertools import pairwise
 
@@ -15,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from hil.scenario import MotionConfig, load
 from hil.world.motion import Motion
 from hil.world.pole import PoleFlight
+from nav import step as kernels
 from nav.earth import GM, J2, RATE, A, curvature_radii, normal_gravity
 from nav.errors import HilError
 from nav.gravitation import J2_FIELD, NORMAL, gravitation_cartesian, gravitation_local, near_latitude
@@ -633,15 +636,140 @@ def test_what_is_not_a_number_never_enters(mechanization, value):
     assert np.isfinite(navigator.process(record(dtheta, dvel, 0.01))["vel_n"]).all()
 
 
-def test_a_kept_push_keeps_the_memory_that_it_works_on():
-    core = Strapdown()
-    begin(core, MOTIONS["flight"].truth([0.0])[0])
-    core.push(0.01, 0.0, 0.0, 0.0, 0.0, 0.0, -0.098)
-    push, memory = core.push, weakref.ref(core._core)
+# What a caller may hand over
+
+
+def moving(attitude="two-sample", mechanization="geographic", whole=False, samples=12):
+    """A core in flight, and the samples that it takes next."""
+    core = Strapdown(attitude, mechanization, whole_record=whole)
+    begin(core, MOTIONS["agile"].truth([0.0])[0])
+    step, dtheta, dvel = increments(MOTIONS["agile"], 1.0, 0.01)
+    for row in np.column_stack([step, dtheta, dvel])[:samples].tolist():
+        core.push(*row)
+    return core, (step[samples:], dtheta[samples:], dvel[samples:])
+
+
+def test_a_kept_push_keeps_its_core():
+    core, (step, dtheta, dvel) = moving()
+    push, memory = core.push, weakref.ref(core.solution.base)
     del core
     gc.collect()
-    assert memory() is not None
-    assert push(0.01, 1e-4, 0.0, 0.0, 0.0, 0.0, -0.098) == DONE
-    del push
-    gc.collect()
-    assert memory() is None
+    assert memory() is not None, "push writes into freed memory"
+    assert push(step[0], *dtheta[0], *dvel[0]) == DONE
+
+
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:8", "coning:3"])
+@pytest.mark.parametrize("samples", [0, 3, 12])
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda core: pickle.loads(pickle.dumps(core))])
+def test_a_copy_goes_on_alone(attitude, samples, copied):
+    core, record = moving(attitude, samples=samples)
+    twin, before = copied(core), core.solution.copy()
+    rows = np.column_stack(record).tolist()
+    for row in rows:
+        assert twin.push(*row) == DONE
+    np.testing.assert_array_equal(core.solution, before)
+    for row in rows:
+        core.push(*row)
+    np.testing.assert_array_equal(core.solution, twin.solution)
+
+
+@pytest.mark.parametrize(
+    ("change", "say"),
+    [
+        ({"dtheta": lambda n: np.zeros((n - 1, 3))}, "dtheta: shape"),
+        ({"dvel": lambda n: np.zeros((n, 2))}, "dvel: shape"),
+        ({"dtheta": lambda n: np.zeros((3, n))}, "dtheta: shape"),
+        ({"gyro_bias": lambda n: np.zeros(2)}, "gyro_bias: shape"),
+        ({"gyro_bias": lambda n: np.full(3, math.nan)}, "the gyro bias is not a number"),
+        ({"position": lambda n: np.zeros((n - 1, 3))}, "position: shape"),
+        ({"velocity": lambda n: np.zeros((n, 3), np.float32)}, "velocity: float32"),
+        ({"attitude": lambda n: np.zeros((n, 8))[:, ::2]}, "attitude: float64 where a contiguous"),
+    ],
+)
+def test_no_kernel_reads_or_writes_beyond_its_arrays(change, say):
+    core, (step, dtheta, dvel) = moving()
+    n, before = len(step), core.solution.copy()
+    right = {"step": step, "dtheta": dtheta, "dvel": dvel, "gyro_bias": np.zeros(3)}
+    right |= {"position": np.zeros((n, 3)), "velocity": np.zeros((n, 3)), "attitude": np.zeros((n, 4))}
+    with pytest.raises(HilError, match=say):
+        core.advance(**right | {name: make(n) for name, make in change.items()})
+    np.testing.assert_array_equal(core.solution, before)
+
+
+def test_any_array_of_numbers_is_taken_without_compiling_anew():
+    expected, record = moving()
+    advance(expected, *record)
+    versions = len(kernels.advance.signatures)
+    for change in (
+        np.ndarray.tolist,
+        np.asfortranarray,
+        lambda x: np.repeat(x, 2, axis=0)[::2],
+        lambda x: np.frombuffer(x.tobytes()).reshape(x.shape),  # read-only
+    ):
+        core, (step, *rest) = moving()
+        n = len(step)
+        core.advance(*(change(x) for x in (step, *rest)), [0, 0, 0], *(np.empty((n, k)) for k in (3, 3, 4)))
+        np.testing.assert_array_equal(core.solution, expected.solution)
+    assert len(kernels.advance.signatures) == versions
+
+
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4", "coning:3"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_refused_batch_leaves_no_trace(attitude, whole):
+    core, (step, dtheta, dvel) = moving(attitude, samples=0 if whole else 12, whole=whole)
+    clean = copy.copy(core)
+    wrong = dvel.copy()
+    wrong[20, 0] = math.inf
+    with pytest.raises(HilError, match="increment 20 of the batch is not a number"):
+        advance(core, step, dtheta, wrong)
+    _, *got = advance(core, step, dtheta, dvel)
+    _, *expected = advance(clean, step, dtheta, dvel)
+    for one, other in zip(got, expected, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4", "coning:3"])
+def test_increments_too_large_to_be_any_are_told(attitude):
+    core, (step, dtheta, dvel) = moving(attitude)
+    with pytest.raises(HilError, match="too large"):
+        advance(core, step, 1e200 + dtheta, dvel)
+    core, (step, dtheta, dvel) = moving()
+    assert core.push(step[0], 1e200, 0.0, 0.0, *dvel[0]) == NOT_FINITE
+
+
+@pytest.mark.parametrize("attitude", ["two-sample", "high-order:4", "coning:3"])
+@pytest.mark.parametrize("whole", [False, True])
+def test_steps_below_zero_change_nothing(attitude, whole):
+    cores = [moving(attitude, whole=whole, samples=0) for _ in range(2)]
+    (plain, (step, dtheta, dvel)), (padded, _) = cores
+    _, *expected = advance(plain, step, dtheta, dvel)
+    longer = np.stack([-step, step], axis=1).ravel()
+    _, *got = advance(padded, longer, dtheta.repeat(2, 0), dvel.repeat(2, 0))
+    for one, other in zip(expected, got, strict=True):
+        np.testing.assert_array_equal(one, other[1::2])
+
+
+@pytest.mark.parametrize("mechanization", MECHANIZATIONS)
+def test_a_start_is_a_place_and_a_rotation(mechanization):
+    row, cores = MOTIONS["agile"].truth([0.0])[0], [Strapdown("two-sample", mechanization) for _ in range(2)]
+    place, vel_n, q_nb = (row["lat"], row["lon"], row["height"]), row["vel_n"], row["q_nb"]
+    for core, norm in zip(cores, (1.0, 2.0), strict=True):
+        core.start(*place, vel_n, norm * q_nb)
+        advance(core, *increments(MOTIONS["agile"], 1.0, 0.01))
+    np.testing.assert_allclose(cores[1].solution, cores[0].solution, rtol=1e-12)
+    before = core.solution.copy()
+    for start, say in (
+        ((math.nan, *place[1:], vel_n, q_nb), "not a number"),
+        ((1.6, *place[1:], vel_n, q_nb), "beyond a pole"),
+        ((*place, vel_n[:2], q_nb), "shape"),
+        ((*place, vel_n, 0.0 * q_nb), "no rotation"),
+        ((*place, vel_n, q_nb, math.inf), "not a number"),
+    ):
+        with pytest.raises(HilError, match=say):
+            core.start(*start)
+    np.testing.assert_array_equal(core.solution, before)
+
+
+def test_a_whole_record_is_not_pushed():
+    with pytest.raises(HilError, match="whole record"):
+        moving("high-order:4", whole=True)
