@@ -31,7 +31,6 @@ from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.calibration import CASES, Calibration, cases
 from nav.instruments.calibration_stretch import Stretch
 from nav.instruments.channels import TRIAD
-from nav.instruments.dtg import Rotor
 from nav.instruments.gyro_errors import GyroErrors
 from nav.instruments.redundancy import AXES
 from nav.rotation import dcm_from_rotation_vector
@@ -130,7 +129,6 @@ def fit(
     *,
     skew: float = 0.0,
     attitude_sigma: float = 0.0,
-    rotors: tuple[Rotor, Rotor] | None = None,
 ) -> Fit:
     """Calibration of the head that gave `stretches`.
 
@@ -144,8 +142,6 @@ def fit(
         How far each gyro is turned about its spin axis, rad.
     attitude_sigma : float
         1-sigma of the nominal attitudes about each axis, rad; 0: they are exact.
-    rotors : pair of Rotor, optional
-        Those by which the lag was taken off; they go into the calibration.
 
     Raises
     ------
@@ -155,7 +151,7 @@ def fit(
     _require(stretches)
     problem = _Problem(stretches, lat, height, skew)
     problem.check()
-    return problem.solve(attitude_sigma, rotors)
+    return problem.solve(attitude_sigma)
 
 
 def _require(stretches: Sequence[Stretch]) -> None:
@@ -240,7 +236,7 @@ class _Problem:
             columns[np.arange(len(self.rows)), 3 * stretch_of + i] = (ends[0] - ends[1]) / (2.0 * small)
         return columns
 
-    def solve(self, attitude_sigma: float, rotors: tuple[Rotor, Rotor] | None) -> Fit:
+    def solve(self, attitude_sigma: float) -> Fit:
         """Gauss-Newton over attitudes and weights."""
         n, u, count = len(self.rows), len(self.unknowns), len(self.stretches)
         required = np.array([REQUIRED[_KINDS[axis]][name] for axis, name in self.unknowns])
@@ -279,7 +275,7 @@ class _Problem:
             factor = factor * change
         inverse = np.linalg.inv(r)
         covariance = (inverse @ inverse.T)[moved:, moved:]
-        return self._fit(theta, kept, covariance, residual * sigma, factor, redundancy, errors, rotors)
+        return self._fit(theta, kept, covariance, residual * sigma, factor, redundancy, errors)
 
     def _fit(
         self,
@@ -290,7 +286,6 @@ class _Problem:
         factor: FloatArray,
         redundancy: FloatArray,
         errors: FloatArray,
-        rotors: tuple[Rotor, Rotor] | None,
     ) -> Fit:
         sigma = np.full(len(theta), math.inf)
         sigma[kept] = np.sqrt(np.diag(covariance))
@@ -304,7 +299,6 @@ class _Problem:
             Calibration(
                 GyroErrors(**_fields(gyro), channels=CASES),
                 AccelerometerErrors(**_fields(force)),
-                rotors,
                 **{name: tuple(map(float, values)) for name, values in ends.items()},
             ),
             *(dict(self._values(sigma, kind)) for kind in ("gyro", "accelerometer")),
