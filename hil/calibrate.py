@@ -149,7 +149,9 @@ def calibrate(
         raise HilError(f"sequence {sequence_file}: recording = {missing[0]!r}: it is not among the recordings given")
     unused = sorted(set(given) - {step.recording for step in steps})
     if unused:
-        raise HilError(f"sequence {sequence_file}: nothing is said of the recording {unused[0]}; leave it out or say it")
+        raise HilError(
+            f"sequence {sequence_file}: nothing is said of the recording {unused[0]}; leave it out or say it"
+        )
     if not steps:
         raise HilError(f"sequence {sequence_file}: no [[position]] and no [[turn]]")
     head = load(scenario_file).head if scenario_file else _scenario_of(recordings[0]).head
@@ -225,20 +227,19 @@ def _stretch(step: PositionConfig, samples: HeadIncrements, outputs: FloatArray)
     return stretch(f"recording {step.recording}", samples, outputs, part, dcm_from_euler(*attitude), turn)
 
 
-def built_in_sequence() -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def built_in_sequence() -> tuple[list[dict[str, float]], list[dict[str, float]]]:
     """Positions and turns: down along the 6 faces (twice, by half a turn) and the 12 edges of a cube; turns about each axis.
 
     Each is a table of the sequence file without its recording.
     """
-    downs = [(np.array(v, float), k) for k, v in enumerate(np.ndindex(3, 3, 3))]
-    positions = []
-    for v, k in downs:
-        down = v - 1.0
-        sides = int(np.abs(down).sum())
-        headings = {1: (0.0, 180.0), 2: (45.0 * (k % 8),)}.get(sides, ())
-        x, y, z = down / max(np.linalg.norm(down), 1.0)
-        pitch, roll = math.degrees(-math.asin(x)), math.degrees(math.atan2(y, z)) if y or z else 0.0
-        positions += [{"heading_deg": h, "pitch_deg": round(pitch, 9), "roll_deg": round(roll, 9)} for h in headings]
+    positions: list[dict[str, float]] = []
+    for k, place in enumerate(np.ndindex(3, 3, 3)):
+        x, y, z = (i - 1.0 for i in place)
+        sides = abs(x) + abs(y) + abs(z)
+        headings = {1: (0.0, 180.0), 2: (45.0 * (k % 8),)}.get(int(sides), ())
+        pitch, roll = -math.asin(x / max(math.sqrt(sides), 1.0)), math.atan2(y, z)
+        tilt = {"pitch_deg": round(math.degrees(pitch), 9), "roll_deg": round(math.degrees(roll), 9)}
+        positions += [{"heading_deg": heading, **tilt} for heading in headings]
     turns = [
         {"heading_deg": 0.0, "pitch_deg": pitch, "roll_deg": roll, "rate_deg_s": rate}
         for pitch, roll in ((-90.0, 0.0), (0.0, 90.0), (0.0, 0.0))
@@ -271,18 +272,28 @@ def simulate(
             kind = "turn" if rate else "position"
             path = folder / f"{k:02d}-{kind}.dhil"
             motion = {
-                **{"latitude_deg": place[0], "longitude_deg": place[1], "height_m": place[2]},
+                "latitude_deg": place[0],
+                "longitude_deg": place[1],
+                "height_m": place[2],
                 "heading": {"offset": step["heading_deg"], "rate": rate},
                 **{name: {"offset": step[f"{name}_deg"]} for name in ("pitch", "roll")},
             }
             table = scenario.model_dump(mode="json")
             table |= {"motion": motion, "duration_s": turn_s if rate else position_s, "seed": scenario.seed + 1 + k}
             table["head"] |= {
-                **{"errors_seed": seed, "mounting_deg": (0, 0, 0), "lever_arm_m": (0, 0, 0), "calibration": None}
+                "errors_seed": seed,
+                "mounting_deg": (0, 0, 0),
+                "lever_arm_m": (0, 0, 0),
+                "calibration": None,
             }
             _record(validated(table, "of the simulated calibration"), path)
             say(f"{path.name}: {', '.join(f'{key} = {one:g}' for key, one in step.items())}")
-            lines += ["", f"[[{kind}]]", f'recording = "{path.name}"', *(f"{key} = {one!r}" for key, one in step.items())]
+            lines += [
+                "",
+                f"[[{kind}]]",
+                f'recording = "{path.name}"',
+                *(f"{key} = {one!r}" for key, one in step.items()),
+            ]
             made.append(path)
         (folder / SEQUENCE).write_text("\n".join(lines) + "\n")
     except OSError as error:
@@ -316,7 +327,8 @@ def rows(file: CalibrationFile) -> list[dict[str, Any]]:
             if key.endswith("_k"):
                 zeros = [(0.0,) * len(axes)] * len(sigma)
                 powers = [
-                    (f"{key}[{n}]", value, one) for n, (value, one) in enumerate(zip(values[key] or zeros, sigma, strict=False))
+                    (f"{key}[{n}]", value, one)
+                    for n, (value, one) in enumerate(zip(values[key] or zeros, sigma, strict=False))
                 ]
             for name, value, one in powers:
                 listed += [

@@ -8,7 +8,7 @@ import datetime
 import json
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,7 +26,7 @@ _DEG_H = math.radians(1.0) / 3600.0
 _ARCSEC = _DEG_H
 _PPM = 1e-6
 _G = 9.80665
-_UNITS = {
+UNITS = {
     "gyro": {
         "bias": ("deg_h", _DEG_H),
         "scale": ("ppm", _PPM),
@@ -86,7 +86,7 @@ def _table(kind: str, number: Any, default: float | None) -> type[_Model]:
     fields: dict[str, Any] = {}
     each = Annotated[tuple[number, ...], _as_many(kind)]
     names = CHANNELS[kind]
-    for name, (unit, _) in _UNITS[kind].items():
+    for name, (unit, _) in UNITS[kind].items():
         if name.endswith("temperature"):
             powers = Annotated[tuple[each, ...], Field(max_length=POWERS)]
             fields[f"{name}_{unit}"] = (powers, ())
@@ -140,7 +140,9 @@ class CalibrationFile(_Model):
         for reference, (low, high) in zip(self.reference_c or (), self.range_c or (), strict=True):
             if not low <= reference <= high:
                 raise ValueError(f"range_c = [{low:g}, {high:g}] does not hold reference_c = {reference:g}")
-        depends = any(name.endswith("_k") and getattr(self, kind).__dict__[name] for kind in _UNITS for name in _keys(kind))
+        depends = any(
+            name.endswith("_k") and getattr(self, kind).__dict__[name] for kind in UNITS for name in _keys(kind)
+        )
         if depends and self.reference_c is None:
             raise ValueError("polynomials of the temperature need reference_c and range_c")
         return self
@@ -168,12 +170,12 @@ def rotor_of(config: RotorConfig) -> Rotor:
 
 
 def _keys(kind: str) -> list[str]:
-    return [f"{name}_{unit}" for name, (unit, _) in _UNITS[kind].items()]
+    return [f"{name}_{unit}" for name, (unit, _) in UNITS[kind].items()]
 
 
 def _si(kind: str, table: Any) -> Table:
     values: Table = {}
-    for name, (unit, size) in _UNITS[kind].items():
+    for name, (unit, size) in UNITS[kind].items():
         given = getattr(table, f"{name}_{unit}")
         if name.endswith("temperature"):
             values[name] = tuple(tuple(size * one for one in power) for power in given)
@@ -198,8 +200,8 @@ def from_fit(
             "serial": serial,
             "date": date,
             "skew_deg": skew_deg,
-            "reference_c": c.reference if known else None,
-            "range_c": tuple(zip(c.coldest, c.warmest, strict=True)) if known else None,
+            "reference_c": _scaled(c.reference, 1.0) if known else None,
+            "range_c": tuple(_scaled(ends, 1.0) for ends in zip(c.coldest, c.warmest, strict=True)) if known else None,
             "gyro": _written("gyro", GYRO_TERMS, c.gyros),
             "accelerometer": _written("accelerometer", ACCELEROMETER_TERMS, c.accelerometers),
             "undetermined": fit.undetermined,
@@ -210,32 +212,37 @@ def from_fit(
             "residual": {
                 "positions": counts[0],
                 "turns": counts[1],
-                "gyro_deg_h": tuple((fit.residual[:4] / _DEG_H).tolist()),
-                "accelerometer_ug": tuple((fit.residual[4:] / (1e-6 * _G)).tolist()),
-                "factor": tuple(fit.factor.tolist()),
-                "redundancy": tuple(fit.redundancy.tolist()),
+                "gyro_deg_h": _scaled(fit.residual[:4], _DEG_H),
+                "accelerometer_ug": _scaled(fit.residual[4:], 1e-6 * _G),
+                "factor": _scaled(fit.factor, 1.0),
+                "redundancy": _scaled(fit.redundancy, 1.0),
             },
         }
     )
 
 
+def _scaled(values: Iterable[float], size: float) -> Numbers:
+    """In the unit of the file, to seven digits."""
+    return tuple(float(f"{one / size:.7g}") for one in values)
+
+
 def _written(kind: str, terms: tuple[str, ...], errors: GyroErrors | AccelerometerErrors) -> Table:
     table: Table = {}
-    for name, (unit, size) in _UNITS[kind].items():
+    for name, (unit, size) in UNITS[kind].items():
         value = getattr(errors, name)
         if name.endswith("temperature"):
-            table[f"{name}_{unit}"] = tuple(tuple(one / size for one in power) for power in value)
+            table[f"{name}_{unit}"] = tuple(_scaled(power, size) for power in value)
         elif name in terms and isinstance(value, tuple):
-            table[f"{name}_{unit}"] = tuple(one / size for one in value)
+            table[f"{name}_{unit}"] = _scaled(value, size)
     return table
 
 
 def _written_sigma(kind: str, sigma: Values) -> Table:
     table: Table = {}
-    for name, (unit, size) in _UNITS[kind].items():
-        powers = tuple(tuple((one / size).tolist()) for key, one in sigma.items() if key.startswith(f"{name}["))
+    for name, (unit, size) in UNITS[kind].items():
+        powers = tuple(_scaled(one, size) for key, one in sigma.items() if key.startswith(f"{name}["))
         if name in sigma:
-            table[f"{name}_{unit}"] = tuple((sigma[name] / size).tolist())
+            table[f"{name}_{unit}"] = _scaled(sigma[name], size)
         elif powers:
             table[f"{name}_{unit}"] = powers
     return table
@@ -291,7 +298,11 @@ def write(path: Path, file: CalibrationFile) -> None:
 
 def _toml(table: Table, prefix: str = "") -> list[str]:
     """Lines of a table: its values first, then the tables in it."""
-    lines = [f"{key} = {_value(one)}" for key, one in table.items() if not isinstance(one, dict) and key != "rotor"]
+    lines = [
+        f"{key} = {_value(one)}"
+        for key, one in table.items()
+        if not isinstance(one, dict) and key != "rotor" and one != ()
+    ]
     for key, one in table.items():
         inner = [one] if isinstance(one, dict) else one if key == "rotor" else []
         for part in inner:
@@ -305,4 +316,4 @@ def _value(one: Any) -> str:
         return f"[{', '.join(map(_value, one))}]"
     if isinstance(one, datetime.date):
         return one.isoformat()
-    return f"{one:.7g}" if isinstance(one, float) else json.dumps(one)
+    return repr(one) if isinstance(one, float) else json.dumps(one)

@@ -255,8 +255,12 @@ def _calibrate(
         print(
             json.dumps(
                 {
-                    **{"file": str(out), "serial": file.serial, "date": file.date.isoformat()},
-                    **{"rows": rows(file), "undetermined": file.undetermined, "residual": residual},
+                    "file": str(out),
+                    "serial": file.serial,
+                    "date": file.date.isoformat(),
+                    "rows": rows(file),
+                    "undetermined": file.undetermined,
+                    "residual": residual,
                 }
             )
         )

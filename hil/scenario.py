@@ -244,7 +244,7 @@ def load(path_or_name: str | Path | None) -> Scenario:
     return parse(text, source, folder)
 
 
-def parse(text: str, source: str, folder: Path = Path()) -> Scenario:  # noqa: B008 a constant
+def parse(text: str, source: str, folder: Path = Path()) -> Scenario:
     """The scenario in a TOML text; `source` names it in errors, files that it names are looked for in `folder` first.
 
     Raises
@@ -265,7 +265,7 @@ def built_in_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def validated(table: Mapping[str, Any], source: str, folder: Path = Path()) -> Scenario:  # noqa: B008 a constant
+def validated(table: Mapping[str, Any], source: str, folder: Path = Path()) -> Scenario:
     """The scenario in a table of plain values; `source` names it in errors.
 
     Raises
@@ -283,7 +283,7 @@ def explained(error: ValidationError, source: str) -> str:
     """A line for each key that is wrong: source, key, value, and what was expected."""
     lines = []
     for problem in error.errors():
-        key = ".".join(str(part) for part in problem["loc"]) or source.split()[0]
+        key = ".".join(str(part) for part in problem["loc"]) or source.split(maxsplit=1)[0]
         what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
         value = "" if isinstance(problem["input"], Mapping) else f" = {problem['input']!r}"
         lines.append(f"{source}: {key}{value}: {what}")

@@ -20,7 +20,7 @@ from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerometers
 from nav.instruments.calibration import CASES
-from nav.instruments.dtg import Rotor, move, step_map
+from nav.instruments.dtg import move, step_map
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import GyroErrors, Gyros
 from nav.instruments.head import HeadModel

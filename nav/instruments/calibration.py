@@ -256,15 +256,15 @@ class Calibrator:
         matrix = calibration.accelerometer_matrix()
         if not np.linalg.cond(matrix) < 10.0:
             raise HilError("calibration: the accelerometers' scale factors and misalignments must be small")
-        self._tables = (
+        self._tables: tuple[FloatArray, FloatArray, FloatArray, FloatArray] = (
             _gyro_rows(calibration.gyros, skew),
             _rows(calibration.accelerometers, _ACCELEROMETER_ROW, 3),
-            np.linalg.inv(matrix),
+            np.linalg.inv(matrix).astype(np.float64),
             np.array([calibration.reference, calibration.coldest, calibration.warmest]),
         )
         self._last, self._now = np.full(3, np.nan), np.empty((2, 7))
         gyros, accelerometers, _, ranges = self._tables
-        _at_temperature(self._last, *ranges, gyros, accelerometers, self._now)
+        _at_temperature(self._last, ranges[0], ranges[1], ranges[2], gyros, accelerometers, self._now)
 
     def take_off(self, head: HeadIncrements, gyro: FloatArray, dvel: FloatArray) -> int:
         """Take the errors off a batch, in place; allocates nothing.
@@ -289,7 +289,7 @@ class Calibrator:
 def outside(calibration: Calibration, temperature: ArrayLike) -> str:
     """In words, which of the three temperatures lie outside the range."""
     names = ("gyro 1", "gyro 2", "the accelerometers")
-    rows = zip(
-        names, np.asarray(temperature, float).tolist(), calibration.coldest, calibration.warmest, strict=True
+    rows = zip(names, np.asarray(temperature, float).tolist(), calibration.coldest, calibration.warmest, strict=True)
+    return ", ".join(
+        f"{name} {t:.1f}, calibrated {low:.1f} to {high:.1f}" for name, t, low, high in rows if t < low or t > high
     )
-    return ", ".join(f"{name} {t:.1f}, calibrated {low:.1f} to {high:.1f}" for name, t, low, high in rows if t < low or t > high)

@@ -19,7 +19,7 @@ A coefficient is determined if its sigma, given all that come before it in `GYRO
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -96,10 +96,10 @@ class Fit:
         1-sigma of every coefficient that is fitted; inf where it is not determined.
     undetermined : tuple of str
         Axis and name of these.
-    covariance : FloatArray
-        Of the determined coefficients, in the order of `determined`.
     determined : tuple of (str, str)
-        Axis and name.
+        Axis and name of the others.
+    covariance : (d, d) float
+        Of these, in SI units.
     residual : (7,) float
         Root mean square of what is left of each output, rad/s and m/s^2.
     factor : (2,) float
@@ -114,8 +114,8 @@ class Fit:
     gyro_sigma: Values
     accelerometer_sigma: Values
     undetermined: tuple[str, ...]
-    covariance: FloatArray
     determined: tuple[tuple[str, str], ...]
+    covariance: FloatArray
     residual: FloatArray
     factor: FloatArray
     redundancy: FloatArray
@@ -148,18 +148,14 @@ def fit(
     HilError
         There are too few positions, or a stretch does not show what it is said to be.
     """
-    _require(stretches)
-    problem = _Problem(stretches, lat, height, skew)
-    problem.check()
-    return problem.solve(attitude_sigma)
-
-
-def _require(stretches: Sequence[Stretch]) -> None:
     standing = sum(one.stands for one in stretches)
     if standing < LEAST_POSITIONS:
         raise HilError(
             f"calibration: {standing} positions at rest; it takes {LEAST_POSITIONS} or more, 24 for the terms of higher order"
         )
+    problem = _Problem(stretches, lat, height, skew)
+    problem.check()
+    return problem.solve(attitude_sigma)
 
 
 class _Problem:
@@ -179,7 +175,9 @@ class _Problem:
         white = np.sqrt(np.mean([one.white**2 for one in stretches if one.stands], axis=0))
         if not (white > 0.0).all():
             dead = [AXES[k] for k in np.flatnonzero(~(white > 0.0))]
-            raise HilError(f"calibration: {', '.join(dead)} show no noise at all; an axis is dead or the record is made up")
+            raise HilError(
+                f"calibration: {', '.join(dead)} show no noise at all; an axis is dead or the record is made up"
+            )
         self.white = np.array([white[axis] / math.sqrt(stretches[s].duration) for s, axis in self.rows])
         temperature = np.array([one.temperature for one in stretches])
         self.knows_temperature = bool(np.isfinite(temperature).all())
@@ -197,7 +195,9 @@ class _Problem:
 
     def check(self) -> None:
         """Refuse stretches that do not show what they are said to be."""
-        for one, (s, axis), value in zip((self.stretches[s] for s, _ in self.rows), self.rows, self.measured, strict=True):
+        for one, (s, axis), value in zip(
+            (self.stretches[s] for s, _ in self.rows), self.rows, self.measured, strict=True
+        ):
             expected = float((self._nodes[s][axis // 4] @ self._axes[axis, 0]).mean())
             allowed = _AGAINST_SEQUENCE[axis] + (0.05 * float(np.linalg.norm(one.turn)) if axis < 4 else 0.0)
             if abs(value - expected) > allowed:
@@ -223,17 +223,12 @@ class _Problem:
             nominal[row], by[row, first[axis] : first[axis + 1]] = input_axis, values
         return nominal, by
 
-    def attitude_columns(self, errors: FloatArray, theta: FloatArray) -> FloatArray:
-        """Derivatives (n, 3 s) of the outputs by the attitude errors, by differences, the coefficients being `theta`."""
+    def attitude_columns(self, errors: FloatArray) -> FloatArray:
+        """Derivatives (n, 3 s) of the nominal outputs by the attitude errors: those of the coefficients' part are small."""
         columns = np.zeros((len(self.rows), 3 * len(self.stretches)))
-        stretch_of = np.array([s for s, _ in self.rows])
-        small = 1e-5
-        for i in range(3):
-            ends = []
-            for sign in (1.0, -1.0):
-                nominal, by = self.design(errors + sign * small * np.eye(3)[i])
-                ends.append(nominal + by @ theta)
-            columns[np.arange(len(self.rows)), 3 * stretch_of + i] = (ends[0] - ends[1]) / (2.0 * small)
+        for row, (s, axis) in enumerate(self.rows):
+            vector = self._nodes[s][axis // 4].mean(axis=0) @ dcm_from_rotation_vector(errors[s])
+            columns[row, 3 * s : 3 * s + 3] = np.cross(self._axes[axis, 0], vector)
         return columns
 
     def solve(self, attitude_sigma: float) -> Fit:
@@ -251,7 +246,7 @@ class _Problem:
             right = np.zeros(n + moved)
             rows[:n, moved:], right[:n] = by / sigma[:, None], (self.measured - nominal) / sigma
             if moved:
-                turned = self.attitude_columns(errors, theta)
+                turned = self.attitude_columns(errors)
                 rows[:n, :moved] = turned / sigma[:, None]
                 right[:n] += turned @ errors.ravel() / sigma
                 rows[n:, :moved] = np.eye(moved) / attitude_sigma
@@ -266,10 +261,12 @@ class _Problem:
             errors = solution[:moved].reshape(-1, 3) if moved else errors
             leverage = np.sum(q[:n] ** 2, axis=1)
             redundancy = np.array([np.sum(1.0 - leverage[self.group == g]) for g in range(2)])
-            change = np.array([
-                math.sqrt(np.sum(residual[self.group == g] ** 2) / redundancy[g]) if redundancy[g] > 0.5 else 1.0
-                for g in range(2)
-            ])
+            change = np.array(
+                [
+                    math.sqrt(np.sum(residual[self.group == g] ** 2) / redundancy[g]) if redundancy[g] > 0.5 else 1.0
+                    for g in range(2)
+                ]
+            )
             if turn >= SELECTING and np.abs(change - 1.0).max() < 1e-6:
                 break
             factor = factor * change
@@ -290,32 +287,37 @@ class _Problem:
         sigma = np.full(len(theta), math.inf)
         sigma[kept] = np.sqrt(np.diag(covariance))
         gyro, force = (dict(self._values(theta, kind)) for kind in ("gyro", "accelerometer"))
-        coldest, warmest = self.temperature.min(axis=0) - RANGE_MARGIN, self.temperature.max(axis=0) + RANGE_MARGIN
-        ends: dict[str, Any] = {}
+        calibration = Calibration(GyroErrors(**_fields(gyro), channels=CASES), AccelerometerErrors(**_fields(force)))
         if self.knows_temperature:
-            ends = {"reference": self.reference, "coldest": coldest, "warmest": warmest}
+            ends = (
+                self.reference,
+                self.temperature.min(axis=0) - RANGE_MARGIN,
+                self.temperature.max(axis=0) + RANGE_MARGIN,
+            )
+            reference, coldest, warmest = ((float(a), float(b), float(c)) for a, b, c in ends)
+            calibration = replace(calibration, reference=reference, coldest=coldest, warmest=warmest)
         axes = np.array([axis for _, axis in self.rows])
+        missing = [self.unknowns[k] for k in range(len(theta)) if math.isinf(sigma[k])]
         return Fit(
-            Calibration(
-                GyroErrors(**_fields(gyro), channels=CASES),
-                AccelerometerErrors(**_fields(force)),
-                **{name: tuple(map(float, values)) for name, values in ends.items()},
-            ),
-            *(dict(self._values(sigma, kind)) for kind in ("gyro", "accelerometer")),
-            tuple(f"{AXES[axis]} {name}" for k, (axis, name) in enumerate(self.unknowns) if k not in set(kept)),
-            covariance,
-            tuple((AXES[self.unknowns[k][0]], self.unknowns[k][1]) for k in kept),
-            np.array([np.sqrt(np.mean(residual[axes == axis] ** 2)) for axis in range(7)]),
-            factor,
-            redundancy,
-            errors,
+            calibration,
+            gyro_sigma=dict(self._values(sigma, "gyro")),
+            accelerometer_sigma=dict(self._values(sigma, "accelerometer")),
+            undetermined=tuple(f"{AXES[axis]} {name}" for axis, name in missing),
+            determined=tuple((AXES[self.unknowns[k][0]], self.unknowns[k][1]) for k in kept),
+            covariance=covariance,
+            residual=np.array([np.sqrt(np.mean(residual[axes == axis] ** 2)) for axis in range(7)]),
+            factor=factor,
+            redundancy=redundancy,
+            attitude_error=errors,
         )
 
     def _values(self, theta: FloatArray, kind: str) -> Iterator[tuple[str, FloatArray]]:
         for name in REQUIRED[kind]:
             yield (
                 name,
-                np.array([theta[k] for k, (axis, own) in enumerate(self.unknowns) if own == name and _KINDS[axis] == kind]),
+                np.array(
+                    [theta[k] for k, (axis, own) in enumerate(self.unknowns) if own == name and _KINDS[axis] == kind]
+                ),
             )
 
 

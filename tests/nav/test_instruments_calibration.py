@@ -26,21 +26,40 @@ STEP, SKEW = 1e-3, math.radians(30.0)
 DEG_H, G = math.radians(1.0) / 3600.0, 9.80665
 LAT, HEIGHT = math.radians(50.0), 150.0
 GYRO_SIZES = {
-    **{"bias": 0.1 * DEG_H, "scale": 5e-4, "misalignment_other": 2.5e-4, "misalignment_spin": 2.5e-4},
-    **{"unbalance": 0.5 * DEG_H / G, "quadrature": 0.5 * DEG_H / G, "axial": 0.1 * DEG_H / G, "asymmetry": 1e-5},
-    **{"anisoelasticity": 0.1 * DEG_H / G**2, "anisoelasticity_quadrature": 0.1 * DEG_H / G**2},
+    "bias": 0.1 * DEG_H,
+    "scale": 5e-4,
+    "misalignment_other": 2.5e-4,
+    "misalignment_spin": 2.5e-4,
+    "unbalance": 0.5 * DEG_H / G,
+    "quadrature": 0.5 * DEG_H / G,
+    "axial": 0.1 * DEG_H / G,
+    "asymmetry": 1e-5,
+    "anisoelasticity": 0.1 * DEG_H / G**2,
+    "anisoelasticity_quadrature": 0.1 * DEG_H / G**2,
 }
 FORCE_SIZES = {
-    **{"bias": 1e-3, "scale": 5e-4, "misalignment_output": 2.5e-4, "misalignment_pendulous": 2.5e-4},
-    **{"quadratic": 2e-5 / G, "cubic": 1e-5 / G**2, "cross_io": 1e-5 / G, "cross_ip": 1e-5 / G, "cross_po": 1e-5 / G},
-    **{"asymmetry": 1e-5, "odd_quadratic": 1e-5 / G, "output_square": 1e-5 / G, "pendulous_square": 1e-5 / G},
+    "bias": 1e-3,
+    "scale": 5e-4,
+    "misalignment_output": 2.5e-4,
+    "misalignment_pendulous": 2.5e-4,
+    "quadratic": 2e-5 / G,
+    "cubic": 1e-5 / G**2,
+    "cross_io": 1e-5 / G,
+    "cross_ip": 1e-5 / G,
+    "cross_po": 1e-5 / G,
+    "asymmetry": 1e-5,
+    "odd_quadratic": 1e-5 / G,
+    "output_square": 1e-5 / G,
+    "pendulous_square": 1e-5 / G,
 }
 WHITE = np.repeat([0.002 * math.radians(1.0) / 60.0, 5e-6 * G], [4, 3])
 
 
 def drawn(rng, *, fitted=False):
     """Errors of every term that a calibration takes off, or of those that a fit finds at one temperature."""
-    chosen = [REQUIRED[kind] if fitted else sizes for kind, sizes in (("gyro", GYRO_SIZES), ("accelerometer", FORCE_SIZES))]
+    chosen = [
+        REQUIRED[kind] if fitted else sizes for kind, sizes in (("gyro", GYRO_SIZES), ("accelerometer", FORCE_SIZES))
+    ]
     gyros = {name: tuple(GYRO_SIZES[name] * rng.standard_normal(4)) for name in GYRO_SIZES if name in chosen[0]}
     forces = {name: tuple(FORCE_SIZES[name] * rng.standard_normal(3)) for name in FORCE_SIZES if name in chosen[1]}
     return GyroErrors(**gyros, channels=CASES), AccelerometerErrors(**forces)
@@ -301,8 +320,8 @@ def test_a_wrong_sequence_is_refused():
 
 def noisy(n, rate=(0.0, 0.0, 0.0), seed=0):
     rng = np.random.default_rng(seed)
-    outputs = np.concatenate([layout(0.0) @ rate, [0.0, 0.0, -G]]) + WHITE / math.sqrt(STEP) * rng.standard_normal((n, 7))
-    return outputs
+    mean = np.concatenate([layout(0.0) @ rate, [0.0, 0.0, -G]])
+    return mean + WHITE / math.sqrt(STEP) * rng.standard_normal((n, 7))
 
 
 def test_a_stretch_is_the_mean_and_knows_its_noise():
