@@ -18,7 +18,8 @@ from hil.scenario import Finite, RotorConfig, explained
 from nav.errors import HilError
 from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.calibration import ACCELEROMETER_TERMS, CASES, GYRO_TERMS, POWERS, Calibration
-from nav.instruments.calibration_fit import Fit, Values
+from nav.instruments.calibration_fit import Fit
+from nav.instruments.calibration_terms import Values
 from nav.instruments.dtg import Rotor
 from nav.instruments.gyro_errors import GyroErrors
 

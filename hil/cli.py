@@ -223,8 +223,8 @@ def calibrate(
     if simulate is not None:
         if recordings or sequence or scenario or date:
             raise HilError("--simulate makes the recordings: give nothing but --out beside it")
-        from hil.calibrate import SEQUENCE
-        from hil.calibrate import simulate as make
+        from hil.calibration_sequence import SEQUENCE
+        from hil.calibration_sequence import simulate as make
         from hil.scenario import load
 
         made = make(load(simulate), out, _say)

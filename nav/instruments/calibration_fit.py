@@ -20,7 +20,6 @@ A coefficient is determined if its sigma, given all that come before it in `GYRO
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -30,6 +29,7 @@ from nav.increments import FloatArray, IntArray
 from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.calibration import CASES, Calibration, cases
 from nav.instruments.calibration_stretch import Stretch
+from nav.instruments.calibration_terms import KINDS, REQUIRED, Values, accelerometer_terms, fields, gyro_terms
 from nav.instruments.channels import TRIAD
 from nav.instruments.gyro_errors import GyroErrors
 from nav.instruments.redundancy import AXES
@@ -42,46 +42,8 @@ NODES = 36
 """Places over a turn at which the terms are averaged."""
 RANGE_MARGIN = 5.0
 """The calibrated range is that of the recordings and so much more on both sides, K."""
-_DEG_H = math.radians(1.0) / 3600.0
-_G = 9.80665
-REQUIRED = {
-    "gyro": {
-        "bias": 10.0 * _DEG_H,
-        "scale": 1e-4,
-        "misalignment_other": 1e-4,
-        "misalignment_spin": 1e-4,
-        "unbalance": _DEG_H / _G,
-        "quadrature": _DEG_H / _G,
-        "axial": _DEG_H / _G,
-        "asymmetry": 1e-4,
-        "anisoelasticity": _DEG_H / _G**2,
-        "anisoelasticity_quadrature": _DEG_H / _G**2,
-        "bias_temperature[0]": _DEG_H,
-        "bias_temperature[1]": 0.1 * _DEG_H,
-        "scale_temperature[0]": 1e-4,
-    },
-    "accelerometer": {
-        "bias": 1e-3 * _G,
-        "scale": 1e-3,
-        "misalignment_output": 1e-3,
-        "misalignment_pendulous": 1e-3,
-        "quadratic": 1e-4 / _G,
-        "cubic": 1e-4 / _G**2,
-        "cross_io": 1e-4 / _G,
-        "cross_ip": 1e-4 / _G,
-        "cross_po": 1e-4 / _G,
-        "bias_temperature[0]": 1e-4 * _G,
-        "bias_temperature[1]": 1e-5 * _G,
-        "scale_temperature[0]": 1e-4,
-    },
-}
-"""The coefficients that are fitted, in their order, and the sigma that each must reach."""
-_KINDS = ("gyro",) * 4 + ("accelerometer",) * 3
 _AGAINST_SEQUENCE = np.repeat([math.radians(0.5), 0.5], [4, 3])
 """Outputs further from what the sequence says come of a wrong sequence, rad/s and m/s^2; 5 % of the rate more."""
-
-Values = dict[str, FloatArray]
-"""By the name of the coefficient: one number a channel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +145,7 @@ class _Problem:
         self.knows_temperature = bool(np.isfinite(temperature).all())
         self.temperature = temperature if self.knows_temperature else np.zeros_like(temperature)
         self.reference = self.temperature.mean(axis=0)
-        self.unknowns = [(axis, name) for axis in range(7) for name in REQUIRED[_KINDS[axis]]]
+        self.unknowns = [(axis, name) for axis in range(7) for name in REQUIRED[KINDS[axis]]]
 
     def nodes(self, one: Stretch) -> tuple[FloatArray, FloatArray]:
         """Nominal rate and force (m, 3) in head axes over a stretch."""
@@ -217,7 +179,7 @@ class _Problem:
                 seen, turn = s, dcm_from_rotation_vector(errors[s])
                 rate, force = (vectors @ turn for vectors in self._nodes[s])
             t = self.temperature[s, min(axis // 2, 2)] - self.reference[min(axis // 2, 2)]
-            terms = _gyro_terms if axis < 4 else _accelerometer_terms
+            terms = gyro_terms if axis < 4 else accelerometer_terms
             input_axis, values = terms(rate @ self._axes[axis].T, force @ self._axes[axis].T)
             values += [t, t * t, t * input_axis]
             nominal[row], by[row, first[axis] : first[axis + 1]] = input_axis, values
@@ -234,7 +196,7 @@ class _Problem:
     def solve(self, attitude_sigma: float) -> Fit:
         """Gauss-Newton over attitudes and weights."""
         n, u, count = len(self.rows), len(self.unknowns), len(self.stretches)
-        required = np.array([REQUIRED[_KINDS[axis]][name] for axis, name in self.unknowns])
+        required = np.array([REQUIRED[KINDS[axis]][name] for axis, name in self.unknowns])
         required *= [not name.endswith("]") or self.knows_temperature for _, name in self.unknowns]
         theta, errors, factor = np.zeros(u), np.zeros((count, 3)), np.ones(2)
         kept: list[int] = []
@@ -287,7 +249,7 @@ class _Problem:
         sigma = np.full(len(theta), math.inf)
         sigma[kept] = np.sqrt(np.diag(covariance))
         gyro, force = (dict(self._values(theta, kind)) for kind in ("gyro", "accelerometer"))
-        calibration = Calibration(GyroErrors(**_fields(gyro), channels=CASES), AccelerometerErrors(**_fields(force)))
+        calibration = Calibration(GyroErrors(**fields(gyro), channels=CASES), AccelerometerErrors(**fields(force)))
         if self.knows_temperature:
             ends = (
                 self.reference,
@@ -316,7 +278,7 @@ class _Problem:
             yield (
                 name,
                 np.array(
-                    [theta[k] for k, (axis, own) in enumerate(self.unknowns) if own == name and _KINDS[axis] == kind]
+                    [theta[k] for k, (axis, own) in enumerate(self.unknowns) if own == name and KINDS[axis] == kind]
                 ),
             )
 
@@ -334,27 +296,3 @@ def _determined(rows: FloatArray, required: FloatArray, moved: int) -> list[int]
             kept.append(k)
             basis = np.column_stack([basis, rest / size])
     return kept
-
-
-def _gyro_terms(w: FloatArray, f: FloatArray) -> tuple[float, list[float]]:
-    """Rate along the input axis and the terms in the order of `REQUIRED`, from (m, 3) along input, other input and spin axis."""
-    wi, wo, ws = w.mean(axis=0).tolist()
-    fi, fo, fs = f.mean(axis=0).tolist()
-    asymmetry = 0.5 * float(np.abs(w[:, 0]).mean())
-    uneven = [float((f[:, 0] * f[:, 2]).mean()), float((f[:, 1] * f[:, 2]).mean())]
-    return wi, [1.0, wi, wo, ws, fi, fo, fs, asymmetry, *uneven]
-
-
-def _accelerometer_terms(_: FloatArray, f: FloatArray) -> tuple[float, list[float]]:
-    """Force along the input axis and the terms in the order of `REQUIRED`, at rest."""
-    a, b, c = f[0].tolist()
-    return a, [1.0, a, b, c, a * a, a**3, a * b, a * c, b * c]
-
-
-def _fields(values: Values) -> dict[str, Any]:
-    """As the error models take them: polynomials of temperature as tuples of powers."""
-    fields: dict[str, Any] = {name: tuple(map(float, one)) for name, one in values.items() if not name.endswith("]")}
-    for name in ("bias_temperature", "scale_temperature"):
-        powers = [tuple(map(float, one)) for key, one in values.items() if key.startswith(name)]
-        fields[name] = tuple(powers) if any(any(power) for power in powers) else ()
-    return fields

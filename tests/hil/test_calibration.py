@@ -10,14 +10,15 @@ import pytest
 
 from drivers.logs.recording import RecordingWriter
 from hil.bridge import EVENTS, Loop, LoopOrder, Outlets
-from hil.calibrate import SEQUENCE, built_in_sequence, calibrate, simulate
+from hil.calibrate import calibrate
 from hil.calibration import UNITS, CalibrationFile, read, validated, write
+from hil.calibration_sequence import SEQUENCE, built_in_sequence, simulate
 from hil.cli import main
 from hil.scenario import load, parse
 from hil.world.head import SimulatedHead
 from hil.world.instruments import drawn_errors, head_model
 from nav.errors import HilError
-from nav.instruments.calibration_fit import REQUIRED
+from nav.instruments.calibration_terms import REQUIRED
 from nav.rotation import dcm_from_euler
 
 HEAD = {"instruments": "dtg", "grade": "dtg", "errors_factor": 10, "errors_seed": 5, "serial": 7, "rate_hz": 100}

@@ -14,8 +14,9 @@ from nav.errors import HilError
 from nav.increments import HeadIncrements
 from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerometers
 from nav.instruments.calibration import ACCELEROMETER_TERMS, CASES, GYRO_TERMS, Calibration, Calibrator, cases
-from nav.instruments.calibration_fit import REQUIRED, fit
+from nav.instruments.calibration_fit import fit
 from nav.instruments.calibration_stretch import Stretch, steady_part, stretch, without_lag
+from nav.instruments.calibration_terms import REQUIRED
 from nav.instruments.dtg import HEAD
 from nav.instruments.gyro_errors import GyroErrors, Gyros
 from nav.instruments.head import HeadCombiner, HeadModel
