@@ -13,8 +13,8 @@ Weights: the white noise of the stretches at rest says how the axes compare; one
 accelerometer outputs is taken from the residuals, each over its own redundancy (after Helmert). So repeatability from stretch to
 stretch, which is more than white noise, is in the sigmas.
 
-A coefficient is determined if its sigma, given all that come before it in `GYRO_TERMS` or `ACCELEROMETER_TERMS`, is below
-`REQUIRED`; else it stays zero and is named. The sigmas of the others hold if it is zero indeed.
+A coefficient is determined if its sigma, given all that come before it in `REQUIRED`, is below the
+limit there; else it stays zero and is named. The sigmas of the others hold if it is zero indeed.
 """
 
 import math
@@ -29,7 +29,7 @@ from nav.increments import FloatArray, IntArray
 from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.calibration import CASES, Calibration, cases
 from nav.instruments.calibration_stretch import Stretch
-from nav.instruments.calibration_terms import KINDS, REQUIRED, Values, accelerometer_terms, fields, gyro_terms
+from nav.instruments.calibration_terms import KINDS, REQUIRED, Values, accelerometer_terms, as_errors, gyro_terms
 from nav.instruments.channels import TRIAD
 from nav.instruments.gyro_errors import GyroErrors
 from nav.instruments.redundancy import AXES
@@ -249,7 +249,9 @@ class _Problem:
         sigma = np.full(len(theta), math.inf)
         sigma[kept] = np.sqrt(np.diag(covariance))
         gyro, force = (dict(self._values(theta, kind)) for kind in ("gyro", "accelerometer"))
-        calibration = Calibration(GyroErrors(**fields(gyro), channels=CASES), AccelerometerErrors(**fields(force)))
+        calibration = Calibration(
+            GyroErrors(**as_errors(gyro), channels=CASES), AccelerometerErrors(**as_errors(force))
+        )
         if self.knows_temperature:
             ends = (
                 self.reference,

@@ -62,7 +62,7 @@ def accelerometer_terms(_: FloatArray, f: FloatArray) -> tuple[float, list[float
     return a, [1.0, a, b, c, a * a, a**3, a * b, a * c, b * c]
 
 
-def fields(values: Values) -> dict[str, Any]:
+def as_errors(values: Values) -> dict[str, Any]:
     """As the error models take them: polynomials of temperature as tuples of powers."""
     fields: dict[str, Any] = {name: tuple(map(float, one)) for name, one in values.items() if not name.endswith("]")}
     for name in ("bias_temperature", "scale_temperature"):
