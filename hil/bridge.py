@@ -127,6 +127,7 @@ class Loop:
         self.finished = False
         """The scenario's duration is over."""
         self._combiner = HeadCombiner(head_model(scenario.head))
+        self._calibrated = None if scenario.head.calibration is None else int(scenario.head.calibration["serial"])
         self._outlets = outlets
         self._live = order.paced and order.file is None
         self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
@@ -200,6 +201,11 @@ class Loop:
         imu = combiner.combine(raw)
         for note in combiner.notes():
             self.navigator.tell(note.time, "error" if note.bad else "notice", note.text)
+        if self._calibrated is not None and "serial" in (identity := self.driver.identity()):
+            if identity["serial"] != self._calibrated:
+                text = f"the calibration is of head {self._calibrated}, and head {identity['serial']} is connected"
+                self.navigator.tell(float(raw.time[0]), "warning", text)
+            self._calibrated = None
         return imu
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:

@@ -206,6 +206,72 @@ def record(
 
 
 @app.command()
+def calibrate(
+    recordings: Annotated[list[Path] | None, typer.Argument(help="Recordings of positions and turns.")] = None,
+    out: Annotated[Path | None, typer.Option(help="The calibration file; with --simulate a folder.")] = None,
+    sequence: Annotated[Path | None, typer.Option(help="TOML that says what was done in the recordings.")] = None,
+    simulate: Annotated[
+        str | None, typer.Option(metavar="SCENARIO", help="Make recordings with the simulated head of a scenario.")
+    ] = None,
+    scenario: Annotated[str | None, typer.Option(help="Scenario with rotors and layout of the head.")] = None,
+    date: Annotated[str | None, typer.Option(help="YYYY-MM-DD; left out: that of the recordings.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Fit the calibration of a head to recordings of positions at rest and of turns."""
+    if out is None:
+        raise HilError("--out is missing: the calibration file, or with --simulate the folder")
+    if simulate is not None:
+        if recordings or sequence or scenario or date:
+            raise HilError("--simulate makes the recordings: give nothing but --out beside it")
+        from hil.calibration_sequence import SEQUENCE
+        from hil.calibration_sequence import simulate as make
+        from hil.scenario import load
+
+        made = make(load(simulate), out, _say)
+        _report({"recordings": len(made), "sequence": str(out / SEQUENCE)}, as_json=as_json)
+        return
+    if not recordings or sequence is None:
+        raise HilError("give recordings and --sequence, or --simulate SCENARIO to make them")
+    _calibrate(recordings, sequence, out, scenario, date, as_json=as_json)
+
+
+def _calibrate(
+    recordings: list[Path], sequence: Path, out: Path, scenario: str | None, date: str | None, *, as_json: bool
+) -> None:
+    import datetime
+
+    from hil.calibrate import calibrate as fit_recordings
+    from hil.calibrate import rows
+    from hil.calibration import write
+
+    try:
+        day = None if date is None else datetime.date.fromisoformat(date)
+    except ValueError as error:
+        raise HilError(f"--date {date}: expected YYYY-MM-DD") from error
+    file = fit_recordings(recordings, sequence, scenario, day, _say)
+    write(out, file)
+    if as_json:
+        residual = None if file.residual is None else file.residual.model_dump()
+        print(
+            json.dumps(
+                {
+                    "file": str(out),
+                    "serial": file.serial,
+                    "date": file.date.isoformat(),
+                    "rows": rows(file),
+                    "undetermined": file.undetermined,
+                    "residual": residual,
+                }
+            )
+        )
+        return
+    from hil.console import print_calibration
+
+    print_calibration(file, rows(file))
+    _say(f"calibration written to {out}")
+
+
+@app.command()
 def doctor(as_json: Json = False) -> None:
     """Say what this machine can do, and the command that mends each lack."""
     from hil.doctor import examine

@@ -144,6 +144,27 @@ def print_summary(summary: dict[str, Any]) -> None:
         print(problem, file=sys.stderr)
 
 
+def print_calibration(file: Any, rows: list[dict[str, Any]]) -> None:
+    """A calibration as a table on standard output."""
+    console = Console(highlight=False)
+    table = Table(title=f"head {file.serial}, {file.date}")
+    for column in ("", "axis", "value", "sigma"):
+        table.add_column(column, justify="right" if column in {"value", "sigma"} else "left")
+    for row in rows:
+        known = row["sigma"] is not None
+        value, sigma = (f"{row['value']:.6g}", f"{row['sigma']:.2g}") if known else ("-", "not determined")
+        table.add_row(row["key"], row["axis"], value, sigma)
+    console.print(table)
+    if file.residual is not None:
+        left = file.residual
+        gyro, force = (", ".join(f"{one:.3g}" for one in part) for part in (left.gyro_deg_h, left.accelerometer_ug))
+        print(f"left over, rms: gyros {gyro} deg/h; accelerometers {force} ug")
+        print(
+            f"positions {left.positions}, turns {left.turns}; outputs repeat {left.factor[0]:.2f} (gyros) and "
+            f"{left.factor[1]:.2f} (accelerometers) times as their white noise"
+        )
+
+
 def _print_spreads(console: Console, title: str, spreads: dict[str, dict[str, float]]) -> None:
     table = Table(title=title)
     for column in ("", "rms", "max", "final"):

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from nav.errors import HilError
 
@@ -124,6 +124,25 @@ class HeadConfig(_Model):
     """How far each gyro is turned about its spin axis: 0 is the orthogonal layout, 45 the skewed one."""
     rotor: RotorConfig = RotorConfig()
     faults: tuple[FaultConfig, ...] = ()
+    errors_seed: Annotated[int, Field(ge=0, lt=2**63)] | None = None
+    """Seed of the simulated errors alone, so that runs of one head differ in their noise; left out: that of the scenario."""
+    errors_factor: NotNegative = 1.0
+    """Simulated turn-on errors, times those of the grade."""
+    calibration: Mapping[str, Any] | None = None
+    """What is taken off: a file of `hil calibrate` by its name, or the table in it (:mod:`hil.calibration`)."""
+
+    @field_validator("calibration", mode="before")
+    @classmethod
+    def _read_calibration(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is None:
+            return None
+        from hil.calibration import read, validated
+
+        if isinstance(value, str):
+            folder = (info.context or {}).get("folder", Path())
+            beside = folder / value
+            return read(beside if beside.is_file() else Path(value)).as_table()
+        return validated(value, "in the scenario").as_table()
 
     @field_validator("rate_hz")
     @classmethod
@@ -198,7 +217,7 @@ class Scenario(_Model):
 
         The simulated head announces it, so that a bridge elsewhere knows whether its own truth applies.
         """
-        world = self.model_dump(mode="json", include={"motion", "head", "seed"})
+        world = self.model_dump(mode="json", include={"motion", "head", "seed"}, exclude={"head": {"calibration"}})
         return zlib.crc32(json.dumps(world, sort_keys=True).encode()) or 1
 
 
@@ -213,6 +232,7 @@ def load(path_or_name: str | Path | None) -> Scenario:
     source = "default" if path_or_name is None else str(path_or_name)
     built_in = files("fixtures") / "scenarios" / f"{source}.toml"
     path = Path(source)
+    folder = path.parent
     if path.suffix != ".toml" and built_in.is_file():
         text, source = built_in.read_text(), f"built-in scenario {source}"
     else:
@@ -223,11 +243,11 @@ def load(path_or_name: str | Path | None) -> Scenario:
             raise HilError(
                 f"scenario {source}: {reason}; give a TOML file or one of: {', '.join(built_in_names())}"
             ) from error
-    return parse(text, source)
+    return parse(text, source, folder)
 
 
-def parse(text: str, source: str) -> Scenario:
-    """The scenario in a TOML text; `source` names it in errors.
+def parse(text: str, source: str, folder: Path = Path()) -> Scenario:
+    """The scenario in a TOML text; `source` names it in errors, files that it names are looked for in `folder` first.
 
     Raises
     ------
@@ -238,7 +258,7 @@ def parse(text: str, source: str) -> Scenario:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise HilError(f"scenario {source}: not TOML: {error}") from error
-    return validated(table, source)
+    return validated(table, source, folder)
 
 
 def built_in_names() -> list[str]:
@@ -247,7 +267,7 @@ def built_in_names() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
 
 
-def validated(table: Mapping[str, Any], source: str) -> Scenario:
+def validated(table: Mapping[str, Any], source: str, folder: Path = Path()) -> Scenario:
     """The scenario in a table of plain values; `source` names it in errors.
 
     Raises
@@ -256,15 +276,20 @@ def validated(table: Mapping[str, Any], source: str) -> Scenario:
         A key is unknown or has a wrong value.
     """
     try:
-        return Scenario.model_validate(table)
+        return Scenario.model_validate(table, context={"folder": folder})
     except ValidationError as error:
-        lines = []
-        for problem in error.errors():
-            key = ".".join(str(part) for part in problem["loc"]) or "scenario"
-            what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
-            value = "" if isinstance(problem["input"], Mapping) else f" = {problem['input']!r}"
-            lines.append(f"scenario {source}: {key}{value}: {what}")
-        raise HilError("\n".join(lines)) from error
+        raise HilError(explained(error, f"scenario {source}")) from error
+
+
+def explained(error: ValidationError, source: str) -> str:
+    """A line for each key that is wrong: source, key, value, and what was expected."""
+    lines = []
+    for problem in error.errors():
+        key = ".".join(str(part) for part in problem["loc"]) or source.split(maxsplit=1)[0]
+        what = "unknown key" if problem["type"] == "extra_forbidden" else problem["msg"]
+        value = "" if isinstance(problem["input"], Mapping) else f" = {problem['input']!r}"
+        lines.append(f"{source}: {key}{value}: {what}")
+    return "\n".join(lines)
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

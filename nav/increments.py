@@ -117,6 +117,8 @@ class HeadIncrements:
         driver documents.
     spin : (n, 2) float
         Rotor speeds of both gyros as last said, Hz; NaN before.
+    temperature : (n, 3) float
+        Of gyro 1, gyro 2 and the accelerometers as last said, degrees Celsius; NaN before.
     """
 
     time: FloatArray
@@ -128,6 +130,7 @@ class HeadIncrements:
     sequence: IntArray
     status: IntArray
     spin: FloatArray
+    temperature: FloatArray
 
     def __len__(self) -> int:
         return len(self.time)
@@ -144,6 +147,7 @@ class HeadIncrements:
             self.sequence[start:stop],
             self.status[start:stop],
             self.spin[start:stop],
+            self.temperature[start:stop],
         )
 
     @staticmethod
@@ -159,4 +163,5 @@ class HeadIncrements:
             np.zeros(n, np.int64),
             np.zeros(n, np.int64),
             np.full((n, 2), np.nan),
+            np.full((n, 3), np.nan),
         )

@@ -25,8 +25,9 @@ FAULTS = 0x03FF
 """Status bits that make a sample suspect."""
 ROTOR_VALID = 0x8000
 """Status bit: the rotor angles are there."""
-# What the slow frames have said, a row for each frame: sample period (us), status bits of the built-in test, rotor speeds (Hz).
-_PERIOD, _BIT, _SPIN, _SAID = 0, 1, slice(2, 4), 4
+# What the slow frames have said, a row for each frame: sample period (us), status bits of the built-in test, rotor speeds (Hz),
+# temperatures (degrees Celsius).
+_PERIOD, _BIT, _SPIN, _TEMPERATURE, _SAID = 0, 1, slice(2, 4), slice(4, 7), 7
 _BUILT_IN = ("bit_g1", "bit_g2", "bit_ax", "bit_ay", "bit_az")
 """Signals of HEAD_BIT, in the order of the status bits that say the same."""
 WINDOW = 64
@@ -181,7 +182,7 @@ class DtgHead:
         self.period_s: float | None = None
         self.world_id = 0
         self._identity: dict[str, object] = {}
-        self._now = np.array([0.0, 0.0, np.nan, np.nan])
+        self._now = np.array([0.0, 0.0, *[np.nan] * 5])
         """What the slow frames have said so far."""
         self._state = np.zeros(6, np.int64)
         self._outcome = np.zeros(7, np.int64)
@@ -258,7 +259,7 @@ class DtgHead:
         if invalid.any():
             result.rotor[invalid] = np.nan
         said = said[rows]
-        result.spin[:] = said[:, _SPIN]
+        result.spin[:], result.temperature[:] = said[:, _SPIN], said[:, _TEMPERATURE]
         result.status[:] = kept[:, _STATUS].astype(np.int64) | said[:, _BIT].astype(np.int64)
         result.validity[said[:, _BIT] != 0.0] |= Validity.SENSOR.value
         self._arrivals = times[rows]
@@ -310,6 +311,8 @@ class DtgHead:
             self._now[_BIT] = sum(1 << k for k, name in enumerate(_BUILT_IN) if said[name])
         if codec.name == "HEAD_ROTOR":
             self._now[_SPIN] = said["rotor_speed_g1"], said["rotor_speed_g2"]
+        if codec.name == "HEAD_TEMPERATURE":
+            self._now[_TEMPERATURE] = [said[f"temperature_{part}"] for part in ("g1", "g2", "acc")]
         self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
 
     def _classic_samples(self, batch: FrameArray, said: FloatArray) -> HeadIncrements:

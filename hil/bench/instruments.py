@@ -1,6 +1,7 @@
 """The instruments: what the core takes off, and what the simulated head is made of."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from hil.bench.timing import Row, Sizes, Work, rows_in_turns
 from nav.increments import HeadIncrements
 from nav.instruments.accelerometer_errors import Accelerometers
+from nav.instruments.calibration import CASES, Calibration, Calibrator
 from nav.instruments.dtg_compensation import LagCompensator
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import Gyros
@@ -30,6 +32,7 @@ def rows(sizes: Sizes) -> list[Row]:
     gyros, forces = Gyros(gyro_errors, step, rng), Accelerometers(force_errors, step, rng)
     works = [
         *_lag(n, rng),
+        _calibration(n, rng),
         Work(
             "size-effect",
             "size effect of three pendulums, compensated",
@@ -41,6 +44,15 @@ def rows(sizes: Sizes) -> list[Row]:
         Work("force-errors", "errors of three accelerometers, DTG head", lambda: forces.sense(dvel), n),
     ]
     return rows_in_turns(works, sizes.repeats)
+
+
+def _calibration(n: int, rng: np.random.Generator) -> Work:
+    gyros, forces = replace(GRADES["dtg"], gyro_channels=CASES).draw(rng)
+    calibrator, head = Calibrator(Calibration(gyros, forces), 0.0), HeadIncrements.empty(n)
+    head.step[:], head.temperature[:] = 1e-3, 40.0
+    gyro, dvel = rng.normal(0.0, 1e-3, (n, 4)), rng.normal(0.0, 1e-2, (n, 3))
+    what = "calibration of four gyro axes and three accelerometers, batch"
+    return Work("calibration", what, lambda: calibrator.take_off(head, gyro, dvel), n)
 
 
 def _lag(n: int, rng: np.random.Generator) -> Iterator[Work]:

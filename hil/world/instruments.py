@@ -14,11 +14,14 @@ from typing import Any
 import numpy as np
 
 from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
-from hil.scenario import HeadConfig, RotorConfig, Scenario
+from hil.calibration import CalibrationFile, rotor_of
+from hil.scenario import HeadConfig, Scenario
 from hil.world.motion import Motion
+from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerometers
-from nav.instruments.dtg import Rotor, move, step_map
+from nav.instruments.calibration import CASES
+from nav.instruments.dtg import move, step_map
 from nav.instruments.grades import GRADES
 from nav.instruments.gyro_errors import GyroErrors, Gyros
 from nav.instruments.head import HeadModel
@@ -34,8 +37,7 @@ BLOCK_OFFSET_M = 0.03
 """How far the level pendulums' hinges of the simulated block lie out of its centre."""
 GYRO_RANGE = math.radians(180.0)
 """The torquers saturate here, rad/s."""
-_CASE = ((0, 1, 2), (1, 0, 2))
-"""Input, other input and spin axis of a gyro's two channels, in the axes of its case."""
+_TURN_ON = ("gyro_bias", "gyro_scale", "gyro_misalignment", "gyro_g", "accelerometer_bias", "accelerometer_scale")
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +68,6 @@ def mounting(head: HeadConfig) -> FloatArray:
     return c
 
 
-def rotor_of(config: RotorConfig) -> Rotor:
-    """The rotor that a scenario describes."""
-    return Rotor.from_ratios(
-        2.0 * math.pi * config.spin_hz, config.inertia_ratio, config.stiffness_ratio, config.damping_ratio
-    )
-
-
 def block_of(head: HeadConfig) -> tuple[Pendulum, ...]:
     """The pendulums of the simulated block in their places about its centre, in head axes; none where they are ideal."""
     return common_layout(Pendulum(), BLOCK_OFFSET_M) if head.instruments == "dtg" else ()
@@ -81,12 +76,21 @@ def block_of(head: HeadConfig) -> tuple[Pendulum, ...]:
 def head_model(head: HeadConfig) -> HeadModel:
     """What the core takes the head of a scenario for."""
     rotor = rotor_of(head.rotor)
+    calibration = None
+    if head.calibration is not None:
+        table = CalibrationFile.model_validate(head.calibration)
+        if table.skew_deg != head.skew_deg:
+            raise HilError(
+                f"head.calibration: it is of a head with skew_deg = {table.skew_deg:g}, and head.skew_deg = {head.skew_deg:g}"
+            )
+        calibration = table.calibration()
     return HeadModel(
         mounting(head),
         math.radians(head.skew_deg),
         (rotor, rotor) if head.instruments == "dtg" else None,
         block_of(head),
         limits_of(head),
+        calibration,
     )
 
 
@@ -97,12 +101,12 @@ def limits_of(head: HeadConfig) -> Limits:
     limit = Pendulum().limit
     if head.grade == "none":
         return Limits(gyro_range=GYRO_RANGE, accelerometer_range=limit)
-    grade = GRADES[head.grade]
+    grade, factor = GRADES[head.grade], max(head.errors_factor, 1.0)
     return Limits(
         grade.gyro_white,
         grade.accelerometer_white,
-        grade.gyro_scale,
-        grade.gyro_misalignment,
+        factor * grade.gyro_scale,
+        factor * grade.gyro_misalignment,
         GYRO_RANGE,
         limit,
     )
@@ -141,7 +145,8 @@ class DtgInstruments:
         self._gain = -1.0 / rotor.lag
         self._table = step_map(rotor, self._fine, head.rotor.method)
         seeds = np.random.SeedSequence(scenario.seed).spawn(4)
-        errors = _drawn(head, np.random.default_rng(seeds[0]))
+        of_errors = seeds[0] if head.errors_seed is None else np.random.SeedSequence(head.errors_seed).spawn(1)[0]
+        errors = drawn_errors(head, np.random.default_rng(of_errors))
         self._gyros = [Gyros(_part(errors[0], g), step, np.random.default_rng(seeds[1 + g])) for g in range(2)]
         self._accelerometers = Accelerometers(errors[1], step, np.random.default_rng(seeds[3]))
         arm = self._c_hb @ np.asarray(head.lever_arm_m)
@@ -223,11 +228,13 @@ def instruments(scenario: Scenario, step: float) -> Instruments:
     return Faulty(inner, scenario, step) if scenario.head.faults else inner
 
 
-def _drawn(head: HeadConfig, rng: np.random.Generator) -> tuple[GyroErrors, AccelerometerErrors]:
+def drawn_errors(head: HeadConfig, rng: np.random.Generator) -> tuple[GyroErrors, AccelerometerErrors]:
     """Errors of the scenario's grade, for four gyro channels."""
     if head.grade == "none":
-        return GyroErrors(channels=_CASE + _CASE), AccelerometerErrors()
-    return replace(GRADES[head.grade], gyro_channels=_CASE + _CASE).draw(rng)
+        return GyroErrors(channels=CASES), AccelerometerErrors()
+    grade = GRADES[head.grade]
+    sizes: dict[str, Any] = {name: head.errors_factor * getattr(grade, name) for name in _TURN_ON}
+    return replace(grade, gyro_channels=CASES, **sizes).draw(rng)
 
 
 def _part(errors: GyroErrors, gyro: int) -> GyroErrors:

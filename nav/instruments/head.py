@@ -1,6 +1,6 @@
 """From the raw increments of a dual-DTG head to those of one IMU in body axes.
 
-    lag of the gyros taken off -> tests, parity, combination of the four axes -> size effect -> body axes
+    lag of the gyros taken off -> calibration -> tests, parity, combination of the four axes -> size effect -> body axes
 
 A failed axis is left out from the sample after the one that shows it. What the layout cannot spare is said, and the samples
 are flagged: a noisy or saturated axis then goes on being used, a dead one counts as zero.
@@ -14,6 +14,7 @@ import numpy as np
 
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray, Validity
 from nav.instruments import redundancy
+from nav.instruments.calibration import Calibration, Calibrator, outside
 from nav.instruments.dtg import Rotor
 from nav.instruments.dtg_compensation import LagCompensator
 from nav.instruments.pendulum import Pendulum
@@ -46,6 +47,8 @@ class HeadModel:
         Their size effect is taken off; none: there is none.
     limits : Limits
         What healthy instruments do.
+    calibration : Calibration, optional
+        Measured errors of the instruments, taken off; its rotors, if it has any, take the place of `rotors`.
     """
 
     c_bh: FloatArray
@@ -53,6 +56,7 @@ class HeadModel:
     rotors: tuple[Rotor, Rotor] | None = None
     pendulums: Sequence[Pendulum] = ()
     limits: Limits = field(default_factory=Limits)
+    calibration: Calibration | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +106,13 @@ class HeadCombiner:
 
     def __init__(self, model: HeadModel) -> None:
         self._c_bh = np.ascontiguousarray(model.c_bh, dtype=float)
-        self._h = redundancy.layout(model.skew)
+        calibration = self._calibration = model.calibration
+        self._h = redundancy.layout(model.skew) if calibration is None else calibration.gyro_matrix(model.skew)
+        self._calibrator = None if calibration is None else Calibrator(calibration, model.skew)
+        self._outside = False
         self._pair = math.sin(model.skew) == 0.0
-        self._rotors = model.rotors
-        self._lag = None if model.rotors is None else LagCompensator(*model.rotors)
+        self._rotors = (None if calibration is None else calibration.rotors) or model.rotors
+        self._lag = None if self._rotors is None else LagCompensator(*self._rotors)
         self._size = size_coefficients(model.pendulums) if model.pendulums else None
         self._size_memory = np.zeros(SIZE_MEMORY)
         limits = model.limits
@@ -133,7 +140,7 @@ class HeadCombiner:
     def notes(self) -> list[Note]:
         """What happened since the last call."""
         notes, self._notes = self._notes, []
-        return notes
+        return sorted(notes, key=lambda note: note.time)
 
     def combine(self, head: HeadIncrements) -> ImuIncrements:
         """The batch in body axes; valid until the next call.
@@ -153,6 +160,7 @@ class HeadCombiner:
         else:
             self._lag.compensate(head, gyro)
         dvel[:], validity[:] = head.dvel, head.validity
+        self._calibrate(head, gyro, dvel)
         said = self._said(head)
         start = 0
         while start < n:
@@ -184,6 +192,16 @@ class HeadCombiner:
         _turn(self._c_bh, dtheta)
         _turn(self._c_bh, dvel)
         return ImuIncrements(head.time, head.step, dtheta, dvel, validity, head.sequence)
+
+    def _calibrate(self, head: HeadIncrements, gyro: FloatArray, dvel: FloatArray) -> None:
+        if self._calibration is None or self._calibrator is None:
+            return
+        left = self._calibrator.take_off(head, gyro, dvel)
+        if left >= 0 and not self._outside:
+            self._outside = True
+            where = outside(self._calibration, head.temperature[left])
+            text = f"the calibration does not reach this temperature: {where} C; the values of its edge are used"
+            self._notes.append(Note(float(head.time[left]), True, text))
 
     def _said(self, head: HeadIncrements) -> IntArray:
         """Status bits of the instruments, and of the gyros whose rotor does not have its speed."""

@@ -331,3 +331,14 @@ def test_garbage_is_counted_and_never_raises(noise, ids):
     driver.decode(batch)
     assert driver.counters.frames == len(ids) + 5
     assert driver.counters.short == driver.counters.foreign == 0
+
+
+@layouts
+def test_temperatures_hold_for_the_samples_that_follow_them(layout):
+    first, slow, rest = sent(layout, range(3)), deepcopy(_new_encoder(layout)).slow(), sent(layout, range(3, 6))
+    driver = deepcopy(_new_head())
+    driver.decode(deepcopy(_new_encoder(layout)).slow()[1:2])  # the period, and nothing else
+    rows = copied(driver.decode(np.concatenate([first, slow, rest])))
+    assert np.isnan(rows.temperature[:3]).all()
+    assert rows.temperature[3:].tolist() == [[40.0, 40.0, 35.0]] * 3
+    assert driver.identity()["temperature_acc"] == 35.0
