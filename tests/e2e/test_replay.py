@@ -219,7 +219,7 @@ def test_all_kinds_of_frame_logs_replay_alike(recorded: tuple[Path, dict[str, An
     scenario = tmp_path / "same.toml"
     scenario.write_text(
         f"duration_s = {DURATION_S}\n[motion]\nrest_s = 1\nramp_s = 2\nattitude = 'coordinated'\nnorth = {{rate = 1}}\n"
-        "[head]\nrate_hz = 500\nlever_arm_m = [0.5, -0.2, 0.1]\n[navigation]\nalign_s = 0.8\n"
+        "[head]\nrate_hz = 500\ninstruments = 'dtg'\nlever_arm_m = [0.5, -0.2, 0.1]\n[navigation]\nalign_s = 0.8\n"
     )
     digests = {}
     for ending in (".log", ".blf", ".asc"):
