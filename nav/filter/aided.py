@@ -67,7 +67,7 @@ class Settings:
     lever_arm : (3,) float
         From the navigated point (the sensor, if it is not moved) to the GNSS antenna, b, m, as first known.
     delay : float
-        How much older GNSS is than it says, s, as first known.
+        How much older GNSS is than it says, s, as far as known: it is taken at that time. The estimated delay is what is left.
     field_n : (3,) float, optional
         Magnetic flux in n, T; without it no magnetic row is taken.
     """
@@ -231,7 +231,7 @@ class AidedNavigator:
         """
         self._check_started()
         late = math.inf
-        for row in [_row(entry, self.settings.field_n is not None) for entry in np.atleast_1d(rows)]:
+        for row in [_row(entry, self.settings) for entry in np.atleast_1d(rows)]:
             time = row.key[0]
             if time <= self._memories[0].time:
                 self.too_late += 1
@@ -410,7 +410,7 @@ class AidedNavigator:
 
     def _begin_parameters(self) -> None:
         self.estimates[:] = 0.0
-        self.estimates[LEVER_ARM], self.estimates[GNSS_DELAY] = self.settings.lever_arm, self.settings.delay
+        self.estimates[LEVER_ARM] = self.settings.lever_arm
 
     def _own(self) -> tuple[FloatArray, ...]:
         f = self._filter
@@ -461,18 +461,20 @@ def _time(row: _Row) -> float:
     return row.key[0]
 
 
-def _row(row: Any, magnetic: bool) -> _Row:
+def _row(row: Any, settings: Settings) -> _Row:
     """A checked row, and its place in the order: by time, and the same for rows of one time, however they came."""
     time, number, source = float(row["time"]), int(row["kind"]), int(row["source"])
     if number not in _VALUES:
         raise HilError(f"aiding row at {time:g} s: unknown kind {number}; there is: {', '.join(k.name for k in Kind)}")
     kind = Kind(number)
-    if kind == Kind.MAGNETIC and not magnetic:
+    if kind == Kind.MAGNETIC and settings.field_n is None:
         raise HilError("aiding row MAGNETIC: no magnetic field to compare with: give Settings.field_n")
     value, sigma = np.array(row["value"], float), np.array(row["sigma"], float)
     used = value[: _VALUES[kind]]
     if not (math.isfinite(time) and np.isfinite(used).all() and (sigma > 0.0).all()):
         raise HilError(f"aiding row {kind.name} at {time:g} s: a value is no number, or a sigma is not positive")
+    if kind == Kind.GNSS:
+        time -= settings.delay
     return _Row((time, number, source, *map(float, value), *map(float, sigma)), kind, source, value, sigma)
 
 

@@ -92,8 +92,11 @@ def _fill_interval(
                 phi[i, j] = sums[4 + axis] * gain[i, 3 + axis]
             elif state < 24:
                 phi[i, j] = sums[4 + axis] * gain[i, axis]
-            else:
+            elif state < 29:
                 phi[i, j] = 0.0
+            else:
+                gyro, other = (state - 29) // 2, (state - 29) % 2
+                phi[i, j] = sums[1 + (gyro + 1 + other) % 3] * gain[i, gyro]
     # The reset before: columns of the attitude times I - [turn x] / 2.
     tx, ty, tz = 0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2]
     for i in range(9):

@@ -92,13 +92,16 @@ def clear(row: FloatArray) -> None:
 
 
 def quantile(probability: float, freedom: int) -> float:
-    """Chi-square quantile by Wilson and Hilferty (1931): within 1 % for probabilities of 0.9 to 0.9999 and 2 or more
-    degrees of freedom; exact for 1.
-    """
+    """Chi-square quantile of 1, 2 or 3 degrees of freedom."""
     if freedom == 1:
         return NormalDist().inv_cdf(0.5 + 0.5 * probability) ** 2
-    part = 2.0 / (9.0 * freedom)
-    return float(freedom * (1.0 - part + NormalDist().inv_cdf(probability) * math.sqrt(part)) ** 3)
+    if freedom == 2:
+        return -2.0 * math.log1p(-probability)
+    x = -2.0 * math.log1p(-probability) + 2.0
+    for _ in range(20):  # Newton on F = erf sqrt(x / 2) - 2 p(x), p the density
+        density = math.sqrt(x / (2.0 * math.pi)) * math.exp(-0.5 * x)
+        x -= (math.erf(math.sqrt(0.5 * x)) - 2.0 * density - probability) / density
+    return x
 
 
 def inflation(row: FloatArray) -> float:

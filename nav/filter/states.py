@@ -4,7 +4,7 @@ Nine states are the errors of the navigator, computed less true, as in :mod:`nav
 attitude. The others are what is left of the parameters, true less estimated; with w and f the rate and the specific force,
 what the corrected increments still err by is
 
-    dw = gyro bias + gyro scale * w + gyro g * f,     df = accelerometer bias + accelerometer scale * f
+    dw = gyro bias + gyro scale * w + misalignment w + gyro g * f,     df = accelerometer bias + accelerometer scale * f
 
 A parameter without a state is not estimated. What it would have explained becomes noise: constant at 1 g it widens the bias;
 in proportion to the rate (scale factor, misalignment) it is white noise of the density sigma^2 w^2 `TURN_S`, as sure as the
@@ -33,7 +33,9 @@ GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
 GYRO_SCALE, ACCELEROMETER_SCALE = slice(15, 18), slice(18, 21)
 GYRO_G, LEVER_ARM = slice(21, 24), slice(24, 27)
 GNSS_DELAY, BAROMETER_BIAS = slice(27, 28), slice(28, 29)
-STATES = 29
+GYRO_MISALIGNMENT = slice(29, 35)
+"""What gyro x senses of the rates about y and z, gyro y of z and x, gyro z of x and y."""
+STATES = 35
 """Of the full set; every array of states has these places, whatever is used."""
 
 FLICKER_S = 60.0
@@ -52,9 +54,17 @@ class Block(Enum):
     LEVER_ARM = LEVER_ARM
     GNSS_DELAY = GNSS_DELAY
     BAROMETER_BIAS = BAROMETER_BIAS
+    GYRO_MISALIGNMENT = GYRO_MISALIGNMENT
 
 
-SENSOR_BLOCKS = (Block.GYRO_BIAS, Block.ACCELEROMETER_BIAS, Block.GYRO_SCALE, Block.ACCELEROMETER_SCALE)
+SENSOR_BLOCKS = (
+    Block.GYRO_BIAS,
+    Block.ACCELEROMETER_BIAS,
+    Block.GYRO_SCALE,
+    Block.ACCELEROMETER_SCALE,
+    Block.GYRO_MISALIGNMENT,
+)
+"""What is estimated of the sensors where nothing else is said: 27 states."""
 
 
 def places(blocks: Iterable[Block]) -> IntArray:
@@ -139,12 +149,12 @@ def tuning(
     by_scale = 0.0 if Block.ACCELEROMETER_SCALE in blocks else grade.accelerometer_scale * _STANDARD_G
     sigma[ACCELEROMETER_BIAS] = math.hypot(grade.accelerometer_bias, by_scale)
     sigma[GYRO_SCALE], sigma[ACCELEROMETER_SCALE] = share * grade.gyro_scale, grade.accelerometer_scale
-    sigma[GYRO_G] = share * grade.gyro_g
+    sigma[GYRO_G], sigma[GYRO_MISALIGNMENT] = share * grade.gyro_g, np.repeat(share, 2) * grade.gyro_misalignment
     sigma[LEVER_ARM], sigma[GNSS_DELAY], sigma[BAROMETER_BIAS] = lever_arm, delay, barometer
     meet = math.sqrt(2.0 * math.log(2.0) / math.pi * 3.0 / FLICKER_S)
     walk[GYRO_BIAS], walk[ACCELEROMETER_BIAS] = share * meet * grade.gyro_flicker, meet * grade.accelerometer_flicker
     walk[BAROMETER_BIAS] = barometer_walk
-    by_rate = np.full((3, 3), grade.gyro_misalignment**2)
+    by_rate = np.full((3, 3), 0.0 if Block.GYRO_MISALIGNMENT in blocks else grade.gyro_misalignment**2)
     np.fill_diagonal(by_rate, 0.0 if scale_known else grade.gyro_scale**2)
     white = np.concatenate([share * grade.gyro_white, np.full(3, grade.accelerometer_white)])
     return Tuning(blocks, sigma, white, TURN_S * (share**2)[:, None] * by_rate, walk)
@@ -170,13 +180,15 @@ def correct_increments(
     dtheta, dvel : (n, 3) float
         Increments as measured.
     turned, pushed : (n, 3) float
-        Out: (dtheta - bias T - g dvel') / (1 + scale) and dvel' = (dvel - bias T) / (1 + scale).
+        Out: (dtheta - bias T - g dvel' - misalignment dtheta) / (1 + scale) and dvel' = (dvel - bias T) / (1 + scale).
     """
     for k in range(len(step)):
         for i in range(3):
             force = (dvel[k, i] - estimates[12 + i] * step[k]) / (1.0 + estimates[18 + i])
             pushed[k, i] = force
             turn = dtheta[k, i] - estimates[9 + i] * step[k] - estimates[21 + i] * force
+            for j in range(2):
+                turn -= estimates[29 + 2 * i + j] * dtheta[k, (i + 1 + j) % 3]
             turned[k, i] = turn / (1.0 + estimates[15 + i])
 
 
