@@ -132,9 +132,9 @@ def fly(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = list(pool.map(one, range(seeds)))
-    errors, sigma, nees, tilt, heading, nis, rejected = (list(part) for part in zip(*found, strict=True))
-    stacked = (np.array(part) for part in (errors, sigma, nees, tilt, heading))
-    return Runs(looks["time"][1:].copy(), *stacked, nis, int(np.sum(rejected)))
+    errors, sigma, nees, tilt, heading = (np.array([run[k] for run in found]) for k in range(5))
+    rejected = int(sum(run[6] for run in found))
+    return Runs(looks["time"][1:].copy(), errors, sigma, nees, tilt, heading, [run[5] for run in found], rejected)
 
 
 def turns() -> Motion:
@@ -154,7 +154,7 @@ def record(motion: Motion, duration: float) -> ImuIncrements:
     n = round(duration / STEP)
     dtheta, dvel = np.empty((n, 3)), np.empty((n, 3))
     motion.increments(0, n, STEP, dtheta, dvel)
-    time, step = STEP * np.arange(1, n + 1), np.full(n, STEP)
+    time, step = np.asarray(STEP * np.arange(1, n + 1), np.float64), np.full(n, STEP)
     return ImuIncrements(time, step, dtheta, dvel, np.zeros(n, np.int64), np.arange(n))
 
 
@@ -191,10 +191,8 @@ def begin(navigator: AidedNavigator, truth: np.void, tilt: tuple[float, float], 
     """Start from a row of truth with drawn errors: position and velocity of GNSS, tilt and heading of `tilt`, rad."""
     sigma = np.array([*GNSS_SIGMA[:3], *GNSS_SIGMA[3:], tilt[0], tilt[0], tilt[1]])
     wrong = sigma * rng.standard_normal(9)
-    lat, lon, height = (
-        float(part[0])
-        for part in _moved(*(np.array([truth[name]]) for name in ("lat", "lon", "height")), wrong[None, :3])
-    )
+    place = _moved(truth["lat"][None], truth["lon"][None], truth["height"][None], wrong[None, :3])
+    lat, lon, height = (float(part[0]) for part in place)
     q_nb = product(quaternion_from_rotation_vector(wrong[6:]), truth["q_nb"])
     navigator.start(float(truth["time"]), lat, lon, height, truth["vel_n"] + wrong[3:6], q_nb, sigma)
 
@@ -274,7 +272,7 @@ def run(seeds: int = SEEDS, settled: float = SETTLED_S, outage: tuple[float, flo
         for what, angle, limit in zip(("tilt", "heading"), (full.tilt, full.heading), LIMITS_DEG[name], strict=True):
             rms = math.degrees(math.sqrt(float((angle[:, window] ** 2).mean())))
             rows.append(at_most(f"{name}-{what}", f"{where}: rms of {what}", rms, "deg", limit))
-        rms, sigma = growth(full)
+        spread, said = growth(full)
         words = f"{where}: after {outage[1] - outage[0]:g} s without GNSS, rms of position over sigma"
         rows.append(near(f"{name}-outage-ratio", words, rms[-1] / sigma[-1], "1", 0.25, reference=1.0))
         rows.append(shown(f"{name}-outage", f"{where}: rms of position then", rms[-1], "m", reference=sigma[-1]))
@@ -323,8 +321,10 @@ def _plots(flown: dict[str, tuple[Runs, Runs]], outage: tuple[float, float]) -> 
         ]
     plots.append(Plot("outage", "Growth of the position error without GNSS", "s", "m", lines))
     for name, (_, full) in flown.items():
-        sigma = np.degrees(3.0 * full.sigma[0, :, 8])
-        runs = [Line("", full.time, np.degrees(one)) for one in full.heading[:10]]
-        band = Band("3 sigma", full.time, -sigma, sigma)
-        plots.append(Plot(f"heading-{name}", f"Heading error, {GRADES[name].name}", "s", "deg", runs, bands=[band]))
+        wide = np.degrees(3.0 * full.sigma[0, :, 8])
+        shown_runs = [Line("", full.time, np.degrees(one)) for one in full.heading[:10]]
+        band = Band("3 sigma", full.time, -wide, wide)
+        plots.append(
+            Plot(f"heading-{name}", f"Heading error, {GRADES[name].name}", "s", "deg", shown_runs, bands=[band])
+        )
     return plots

@@ -22,12 +22,11 @@ from enum import Enum
 
 import numpy as np
 
-from nav.error_dynamics import ATTITUDE, POSITION, VELOCITY
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.grades import Grade
 from nav.instruments.sources import combination
-from nav.kernel import kernel
+from nav.kernel import inline_kernel, kernel
 
 GYRO_BIAS, ACCELEROMETER_BIAS = slice(9, 12), slice(12, 15)
 GYRO_SCALE, ACCELEROMETER_SCALE = slice(15, 18), slice(18, 21)
@@ -160,6 +159,20 @@ def tuning(
     return Tuning(blocks, sigma, white, TURN_S * (share**2)[:, None] * by_rate, walk)
 
 
+@inline_kernel
+def correct_one(
+    estimates: FloatArray, step: float, dtheta: FloatArray, dvel: FloatArray, turned: FloatArray, pushed: FloatArray
+) -> None:
+    """One sample (3,) of `correct_increments`."""
+    for i in range(3):
+        force = (dvel[i] - estimates[12 + i] * step) / (1.0 + estimates[18 + i])
+        pushed[i] = force
+        turn = dtheta[i] - estimates[9 + i] * step - estimates[21 + i] * force
+        for j in range(2):
+            turn -= estimates[29 + 2 * i + j] * dtheta[(i + 1 + j) % 3]
+        turned[i] = turn / (1.0 + estimates[15 + i])
+
+
 @kernel
 def correct_increments(
     estimates: FloatArray,
@@ -183,13 +196,4 @@ def correct_increments(
         Out: (dtheta - bias T - g dvel' - misalignment dtheta) / (1 + scale) and dvel' = (dvel - bias T) / (1 + scale).
     """
     for k in range(len(step)):
-        for i in range(3):
-            force = (dvel[k, i] - estimates[12 + i] * step[k]) / (1.0 + estimates[18 + i])
-            pushed[k, i] = force
-            turn = dtheta[k, i] - estimates[9 + i] * step[k] - estimates[21 + i] * force
-            for j in range(2):
-                turn -= estimates[29 + 2 * i + j] * dtheta[k, (i + 1 + j) % 3]
-            turned[k, i] = turn / (1.0 + estimates[15 + i])
-
-
-__all__ = ["ATTITUDE", "POSITION", "STATES", "VELOCITY", "Block", "Tuning", "correct_increments", "places", "tuning"]
+        correct_one(estimates, step[k], dtheta[k], dvel[k], turned[k], pushed[k])

@@ -71,6 +71,21 @@ def test_batches_and_arrival_change_no_bit(core):
     assert (outcome(other) == outcome(whole)).all()
 
 
+@pytest.mark.parametrize("core", [("two-sample", "geographic"), ("high-order:4", "wander"), ("picard3", "earth")])
+def test_single_samples_are_the_same_to_the_last_bit(core):
+    whole, other = navigator(core=Strapdown(*core)), navigator(core=Strapdown(*core))
+    whole.aid(ROWS)
+    answers = whole.process(IMU)
+    other.aid(ROWS[:30])
+    for k in range(len(IMU)):
+        found = other.push(IMU.time[k], IMU.step[k], *IMU.dtheta[k], *IMU.dvel[k])
+        if k < 500:
+            assert (found == np.concatenate([part[k] for part in answers])).all()
+        if k == 650:
+            other.aid(ROWS[30:])
+    assert (outcome(other) == outcome(whole)).all()
+
+
 def test_a_late_measurement_matters():
     """Left out, the state is another one: so the equality above says something."""
     without = navigator()
