@@ -274,8 +274,8 @@ def run(seeds: int = SEEDS, settled: float = SETTLED_S, outage: tuple[float, flo
             rows.append(at_most(f"{name}-{what}", f"{where}: rms of {what}", rms, "deg", limit))
         spread, said = growth(full)
         words = f"{where}: after {outage[1] - outage[0]:g} s without GNSS, rms of position over sigma"
-        rows.append(near(f"{name}-outage-ratio", words, rms[-1] / sigma[-1], "1", 0.25, reference=1.0))
-        rows.append(shown(f"{name}-outage", f"{where}: rms of position then", rms[-1], "m", reference=sigma[-1]))
+        rows.append(near(f"{name}-outage-ratio", words, spread[-1] / said[-1], "1", 0.25, reference=1.0))
+        rows.append(shown(f"{name}-outage", f"{where}: rms of position then", spread[-1], "m", reference=said[-1]))
         nis = np.concatenate(own.nis).mean(axis=0) / 3.0
         for what, value in zip(("position", "velocity"), nis, strict=True):
             rows.append(
@@ -313,11 +313,11 @@ def _plots(flown: dict[str, tuple[Runs, Runs]], outage: tuple[float, float]) -> 
         plots.append(Plot(f"nees-{part}", f"Mean NEES of {part}", "s", "1", lines, bands=bounds))
     lines = []
     for name, (_, full) in flown.items():
-        rms, sigma = growth(full)
+        spread, said = growth(full)
         late = full.time >= outage[0]
         lines += [
-            Line(f"{name}: rms", full.time[late], rms[late]),
-            Line(f"{name}: sigma", full.time[late], sigma[late], "--"),
+            Line(f"{name}: rms", full.time[late], spread[late]),
+            Line(f"{name}: sigma", full.time[late], said[late], "--"),
         ]
     plots.append(Plot("outage", "Growth of the position error without GNSS", "s", "m", lines))
     for name, (_, full) in flown.items():
