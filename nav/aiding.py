@@ -24,6 +24,10 @@ class Kind(IntEnum):
     """Attitude q_nb (4, scalar first), from four antennas or another navigator; three sigmas about north, east, down, rad."""
     BODY_VELOCITY = 6
     """Velocity over the ground in body axes (3, m/s); infinite sigma where only some axes are known (a wheel, a keel)."""
+    ZERO_RATE = 7
+    """The body turns with the Earth alone (no values); sigmas about its axes, rad/s."""
+    GRAVITY = 8
+    """The specific force is that against gravity: the vertical (no values); sigmas north, east, m/s^2."""
 
 
 AIDING = np.dtype(

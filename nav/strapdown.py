@@ -8,6 +8,7 @@ mechanization answers in the same terms: geodetic position, velocity in n, q_nb.
 import copy
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from types import MethodType
 from typing import Any
 
@@ -17,12 +18,12 @@ from nav import attitude as attitudes
 from nav import step as kernels
 from nav.body_integrals import MAX_WINDOW, integrate_blocks, integrate_body
 from nav.checks import check_room, read_array
-from nav.earth import RATE
+from nav.earth import RATE, curvature_radii
 from nav.errors import HilError
 from nav.gravitation import field_code
 from nav.increments import FloatArray, first_bad
 from nav.mechanization import cartesian, geographic, wander
-from nav.rotation import normalised
+from nav.rotation import normalised, product, quaternion_from_rotation_vector
 from nav.turn import turns_between
 
 MECHANIZATIONS = kernels.MECHANIZATIONS
@@ -176,6 +177,44 @@ class Strapdown:
         nothing = np.zeros(1), np.zeros((1, 4)), np.zeros((1, 3)), np.zeros((1, 3))
         out = self.solution[None, 0:3], self.solution[None, 3:6], self.solution[None, 6:10]
         wander.advance(self._state, self._field, *nothing, *out, self._azimuth)
+
+    def correct(self, position: FloatArray, velocity: FloatArray, attitude: FloatArray) -> None:
+        """Take errors (:mod:`nav.error_dynamics`) off the solution and go on from it, with the increments before.
+
+        Parameters
+        ----------
+        position : (3,) float
+            North, east, down, m.
+        velocity : (3,) float
+            Of vel_n, m/s.
+        attitude : (3,) float
+            Rotation vector in n that takes the true attitude to the computed one, rad, of any size.
+        """
+        lat, height = float(self.solution[0]), float(self.solution[2])
+        meridian, prime = curvature_radii(math.sin(lat))
+        lon = float(self.solution[1]) - position[1] / ((prime + height) * math.cos(lat))
+        self.solution[0] = lat - position[0] / (meridian + height)
+        self.solution[1] = math.remainder(lon, 2.0 * math.pi)
+        self.solution[2] = height + position[2]
+        self.solution[3:6] -= velocity
+        self.solution[6:10] = product(quaternion_from_rotation_vector(-attitude), self.solution[6:10])
+        before = self._state[cartesian.PREVIOUS_PART].copy()
+        self._settle(self.mechanization, self.azimuth)
+        if self.mechanization == "inertial-source":
+            self._state[cartesian.PREVIOUS_PART] = before
+        self._origin, self._lead = self._state.copy(), None if self._lead is None else []
+
+    def memory(self) -> tuple[Any, ...]:
+        """All that the next answer depends on, for `recall`."""
+        lead = None if self._lead is None else list(self._lead)
+        return self.mechanization, self._core.copy(), self._q, deepcopy(self._stream), lead, self._origin
+
+    def recall(self, memory: tuple[Any, ...]) -> None:
+        """Be again, to the last bit, what `memory` was taken of: the same core, not started anew since."""
+        self.mechanization, core, self._q, stream, lead, self._origin = memory
+        self._core[:] = core
+        self._stream, self._lead = deepcopy(stream), None if lead is None else list(lead)
+        self.push = self._push_first
 
     def _settle(self, mechanization: str, azimuth: float) -> None:
         lat, lon, height = (float(value) for value in self.solution[:3])

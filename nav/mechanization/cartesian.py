@@ -24,6 +24,8 @@ STATE = 29
 """r (3) | v (3) | q (4) | rounding left of r (3) and q (4) | gravitation at the last mid-step (3), its step | sine, cosine
 of the latitude | time since the axes of i and e coincided, what rounding left of it | the increment before (3), its step."""
 _LOW_R, _LOW_Q, _G, _G_STEP, _LAT, _TIME, _PREVIOUS = 10, 13, 17, 20, 21, 23, 25
+PREVIOUS_PART = slice(_PREVIOUS, STATE)
+"""The increment before, where the attitude needs it."""
 
 
 def start(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray, turn_rate: float) -> FloatArray:
