@@ -89,12 +89,15 @@ class Sensors:
         White noise of rate and specific force, rad/sqrt(s) and m/s/sqrt(s). Not stated, it is the scatter of the blocks.
     gyro_bias, accelerometer_bias : float
         rad/s and m/s^2.
+    upright_drift : float
+        What gravity adds to the bias of the upright axis, rad/s; no heading feels it.
     """
 
     angle_random_walk: float = 0.0
     velocity_random_walk: float = 0.0
     gyro_bias: float = 0.0
     accelerometer_bias: float = 0.0
+    upright_drift: float = 0.0
 
 
 UNSTATED = Sensors()
