@@ -163,7 +163,7 @@ class MotionAlignment:
     def _refuse_misfit(self, sums: FloatArray, fit: float, gyro: float) -> None:
         """Refuse residuals that nothing explains; the length of the vectors is free: the accelerometers' scale and bias."""
         left = float(np.trace(sums[_MEASURED, _MEASURED]) - fit**2 / np.trace(sums[_KNOWN, _KNOWN]))
-        explained = 3.0 * self._fixes + gyro * float(np.einsum("ii", sums[_BY_GYRO, _BY_GYRO]))
+        explained = 3.0 * self._fixes + gyro * float(np.trace(sums[_BY_GYRO, _BY_GYRO]))
         if left > MISFIT**2 * explained:
             raise AlignmentRefused(
                 f"the motion does not fit the fixes: residuals are {math.sqrt(left / explained):.0f} times what their sigmas "

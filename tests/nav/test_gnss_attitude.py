@@ -61,7 +61,8 @@ def test_a_thousand_epochs_err_as_the_geometry_says(antennas):
 
 def test_three_equal_baselines_have_their_closed_form():
     """Satellites all round: U'U = 2 I. R^-1 = (I - 1 1'/4) / sigma^2 makes H = (5 I + 1 1') / sigma^2, but for signs, of
-    orthogonal baselines of 2 m; then P = H^-1 / 2."""
+    orthogonal baselines of 2 m; then P = H^-1 / 2.
+    """
     u = np.concatenate([np.eye(3), -np.eye(3)])
     found = attitude(u, phases(u, SPACE, true=Rotation.identity()), SPACE, WAVE, SIGMA)
     by_hand = 0.5 * np.linalg.inv(5.0 * np.eye(3) + np.ones((3, 3)))
