@@ -20,7 +20,7 @@ def run(
     tracked: int = TRACKED,
     tracked_s: float = TRACKED_S,
 ) -> Study:
-    """All of it; some three minutes."""
+    """All of it; some minutes."""
     rows, plots = standing(seeds, duration)
     more_rows, more_plots = flying(flights, flight_s, tracked_s, tracked)
     about = (
