@@ -171,9 +171,21 @@ class Strapdown:
         HilError
             The mechanization is not ``wander``.
         """
+        self.correct_platform(np.array([0.0, 0.0, -change]), np.zeros(3), np.zeros(3), 0.0)
+
+    def correct_platform(self, platform: FloatArray, tilt: FloatArray, vel_w: FloatArray, height: float) -> None:
+        """Correct the wander mechanization's state as :func:`nav.mechanization.wander.correct` does.
+
+        Raises
+        ------
+        HilError
+            The mechanization is not ``wander``.
+        """
         if self.mechanization != "wander":
-            raise HilError(f"mechanization {self.mechanization!r} has no azimuth to correct: choose wander")
-        wander.correct_azimuth(self._state, change)
+            raise HilError(
+                f"mechanization {self.mechanization!r} has no azimuth and no platform to correct: choose wander"
+            )
+        wander.correct(self._state, platform, tilt, vel_w, height)
         nothing = np.zeros(1), np.zeros((1, 4)), np.zeros((1, 3)), np.zeros((1, 3))
         out = self.solution[None, 0:3], self.solution[None, 3:6], self.solution[None, 6:10]
         wander.advance(self._state, self._field, *nothing, *out, self._azimuth)

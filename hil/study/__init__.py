@@ -9,7 +9,7 @@ from nav.errors import HilError
 
 _MODULES = {
     name: f"hil.study.{name}"
-    for name in ("orientation", "navigation", "noise", "dtg", "pendulum", "redundancy", "drift", "aiding")
+    for name in ("orientation", "navigation", "noise", "dtg", "pendulum", "redundancy", "drift", "alignment", "aiding")
 }
 """Studies by name: modules with a function ``run() -> Study``."""
 

@@ -269,7 +269,7 @@ def _check_rate(mean: Means, lat: float, sensors: Sensors, noise_w: float) -> No
     allowed = RATE_TOLERANCE * RATE + SIGMAS * noise_w
     if sensors.gyro_bias > 0.0:
         tilt = math.hypot(_noise(mean, sensors)[0], sensors.accelerometer_bias) / float(np.linalg.norm(mean.f))
-        allowed = ODD * math.hypot(noise_w, sensors.gyro_bias, RATE * tilt)
+        allowed = ODD * math.hypot(noise_w, sensors.gyro_bias, sensors.upright_drift, RATE * tilt)
     if abs(vertical - RATE * math.sin(lat)) > allowed:
         fits = math.degrees(math.asin(max(-1.0, min(1.0, vertical / RATE))))
         raise AlignmentRefused(

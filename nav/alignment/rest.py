@@ -90,6 +90,8 @@ class Sensors:
         White noise of rate and specific force, rad/sqrt(s) and m/s/sqrt(s). Not stated, it is the scatter of the blocks.
     gyro_bias, accelerometer_bias : float
         rad/s and m/s^2.
+    upright_drift : float
+        What gravity adds to the bias of the upright axis, rad/s; no heading feels it.
 
     Raises
     ------
@@ -101,6 +103,7 @@ class Sensors:
     velocity_random_walk: float = 0.0
     gyro_bias: float = 0.0
     accelerometer_bias: float = 0.0
+    upright_drift: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what would end in NaN."""

@@ -19,7 +19,7 @@ from nav.frames import level_in_earth
 from nav.gravitation import gravitation_local
 from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
-from nav.rotation import product
+from nav.rotation import product, quaternion_from_rotation_vector
 from nav.turn import change_by_turn, cross, turn_of
 
 STATE = 20
@@ -41,14 +41,25 @@ def start(
     return state
 
 
-def correct_azimuth(state: FloatArray, change: float) -> None:
-    """Correct A by `change`, rad, and nothing else: Babich's correction of the heading.
+def correct(state: FloatArray, platform: FloatArray, tilt: FloatArray, vel_w: FloatArray, height: float) -> None:
+    """Correct the state by small rotation vectors, rad, and differences, all in w axes.
 
-    The gyroscopic heading psi_r and the velocity in w are taken as exact; in n both turn with A.
+    Parameters
+    ----------
+    state : (STATE,) float
+        Changed in place.
+    platform : (3,) float
+        Turns w in e: the place by X and Y, the azimuth A by -Z. Velocity and attitude stay as they are in w.
+    tilt : (3,) float
+        Turns the body in w.
+    vel_w, height : (3,) float and float
+        Added to velocity, m/s, and height, m.
     """
-    q_turn = np.array([math.cos(0.5 * change), 0.0, 0.0, -math.sin(0.5 * change)])
-    state[0:4] = product(state[0:4], q_turn)
-    state[12:16] = 0.0
+    state[0:4] = product(state[0:4], quaternion_from_rotation_vector(platform))
+    state[4] += height
+    state[5:8] += vel_w
+    state[8:12] = product(quaternion_from_rotation_vector(tilt), state[8:12])
+    state[12:STATE] = 0.0
 
 
 @inline_kernel

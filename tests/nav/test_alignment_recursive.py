@@ -1,6 +1,7 @@
 """Alignment of records of increments: recursive is batch, the covariance is the scatter, refusals say why."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -179,3 +180,14 @@ def test_an_increment_that_is_not_a_number_is_refused_before_it_spoils_the_sums(
     with pytest.raises(AlignmentRefused, match="increment 17 is not a number: mend the driver or the file"):
         recursive.add(broken)
     np.testing.assert_array_equal(recursive.result().q_nb, before.q_nb)
+
+
+def test_gravity_may_drift_the_upright_axis():
+    """A drift about the vertical bends no heading; stated, it does not refuse the latitude either."""
+    imu, drift = record(600.0, HEAD, 1), 0.1 * DEG / 3600
+    imu.dtheta[:] += imu.step[:, None] * ATTITUDE.inv().apply([0.0, 0.0, drift])
+    with pytest.raises(AlignmentRefused, match="upward part of the rate"):
+        align_at_rest(imu, LAT, HEAD)
+    found = align_at_rest(imu, LAT, replace(HEAD, upright_drift=drift))
+    assert abs(error(found)[2]) < 3.0 * found.sigma_heading
+    assert found.sigma_heading == align_at_rest(record(600.0, HEAD, 1), LAT, HEAD).sigma_heading
