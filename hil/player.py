@@ -71,7 +71,9 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
     elif suffix in {".log", ".blf", ".asc", ".trc", ".csv"}:
         scenario = load(scenario_file).with_changes(duration_s=None)
     else:
-        raise HilError(f"replay {path}: unknown kind; there is: our own recordings, .ulg, .bin, candump .log, .blf, .asc")
+        raise HilError(
+            f"replay {path}: unknown kind; there is: our own recordings, .ulg, .bin, candump .log, .blf, .asc"
+        )
     if bus is not None:
         return LoopOrder(scenario.with_changes(bus=bus), paced=paced), True
     return LoopOrder(scenario, file=path, paced=paced), False
@@ -85,8 +87,10 @@ def _recorded_scenario(path: Path, header: dict[str, Any]) -> Scenario:
 
 
 def _board_scenario(path: Path, log: ImuLog) -> Scenario:
-    """For a board that cannot gyrocompass: level at the start, heading from the log's own estimate, place of the
-    first fix, bias kept at rest."""
+    """For a board that cannot gyrocompass: level at the start, bias kept at rest.
+
+    The heading is the log's own estimate, the place that of the first fix.
+    """
     times = np.asarray(log.attitude_us * 1e-6, float)
     at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
     heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])

@@ -51,14 +51,18 @@ def aiding(time: float, kind: Kind, value: tuple[float, ...], sigma: tuple[float
 def aiding_rows(
     times: ArrayLike, kind: Kind, values: ArrayLike, sigmas: ArrayLike, source: int = 0
 ) -> NDArray[np.void]:
-    """Rows of `AIDING` of one kind and source.
+    """Rows of `AIDING`.
 
     Parameters
     ----------
     times : (n,) array_like
         Device times, s.
+    kind : Kind
+        What all of them measure.
     values, sigmas : (n, m) or (m,) array_like
         As in `Kind`; what is left out of them is zero and infinite.
+    source : int
+        Number of the receiver or sensor.
     """
     values, sigmas = np.atleast_2d(np.asarray(values, float)), np.atleast_2d(np.asarray(sigmas, float))
     rows = np.zeros(np.size(times), AIDING)

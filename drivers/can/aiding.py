@@ -63,7 +63,8 @@ def _messages() -> dict[Kind, _Message]:
 
 def is_aiding(can_ids: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """Whether each identifier (with its flags) is one of those reserved for aiding."""
-    return (can_ids & np.uint32(0xFFFFFFFF - (RESERVED_IDS - 1))) == FIRST_ID
+    found: NDArray[np.bool_] = (can_ids & np.uint32(0xFFFFFFFF - (RESERVED_IDS - 1))) == FIRST_ID
+    return found
 
 
 def merge(samples: FrameArray, aiding: FrameArray, behind: IntArray, per_sample: int = 1) -> FrameArray:

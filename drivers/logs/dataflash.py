@@ -1,12 +1,12 @@
 """ArduPilot DataFlash (`.bin`) through pymavlink's reader: the board's sensors and the autopilot's own attitude.
 
-The first IMU is taken, and all receivers, magnetometers and barometers. Logged rates and forces are those of a moment, so that
-a sample's mean is that of its two ends (trapezoid); after a gap it is the value of its own end. What moves faster than half the logging
-rate is aliased: nothing brings it back.
+The first IMU is taken, and all receivers, magnetometers and barometers. Logged rates and forces are those of a moment, so
+that a sample's mean is that of its two ends (trapezoid); after a gap it is the value of its own end. What moves faster than
+half the logging rate is aliased: nothing brings it back.
 
 A fix is true as long before it was logged as the autopilot's own filter supposes. Its deviations are those of the receiver
-(GPA, UBX3), or come from its dilution of precision; those of magnetometer and barometer are those of the autopilot's filter. The logs have
-no check sums: records that leave their neighbours by more than a second, or hold impossible values, are left out.
+(GPA, UBX3), or come from its dilution of precision; those of magnetometer and barometer are those of the autopilot's filter.
+The logs have no check sums: records that leave their neighbours by more than a second, or hold impossible values, are left out.
 
 The board's clock may be wrong by far. Where it disagrees with the receiver's by more than `CLOCK_TOLERANCE`, all times are scaled
 to the receiver's seconds.
@@ -51,7 +51,8 @@ _BARO_NOISE = (("EK3_ALT_M_NSE", "EK2_ALT_M_NSE", "EKF_ALT_NOISE"), 2.0)  # m
 
 Undulation = Callable[[float, float], float]
 _Columns = Mapping[str, FloatArray]
-_Measured = tuple[AidingArray, IntArray]
+_Measured = tuple[AidingArray, FloatArray]
+"""Rows and their arrivals on the board's clock, us."""
 
 
 def read_dataflash(path: Path, undulation: Undulation) -> ImuLog:
@@ -138,7 +139,9 @@ def _read(path: Path) -> tuple[dict[str, _Columns], dict[str, float]]:
             raise HilError(f"log {path}: not a readable DataFlash log: {error}") from error
     if not found:
         raise HilError(f"log {path}: not a readable DataFlash log: it holds no messages of sensors")
-    return {name: {key: np.array(values) for key, values in columns.items()} for name, columns in found.items()}, parameters
+    return {
+        name: {key: np.array(values) for key, values in columns.items()} for name, columns in found.items()
+    }, parameters
 
 
 def _of(messages: Mapping[str, _Columns], names: tuple[str, ...]) -> dict[int, _Columns]:
@@ -216,19 +219,27 @@ def _fixes(
     fixes = {key: values[good] for key, values in fixes.items()}
     n, us = len(fixes["us"]), fixes["us"]
     if n == 0:
-        return np.zeros(0, AIDING), np.zeros(0, np.int64)
+        return np.zeros(0, AIDING), us
     lat, lon = np.radians(fixes["Lat"]), np.radians(fixes["Lng"])
     height = fixes["Alt"] + [undulation(*place) for place in zip(lat.tolist(), lon.tolist(), strict=True)]
     course = np.radians(fixes["GCrs"])
     velocity = fixes["Spd"] * np.cos(course), fixes["Spd"] * np.sin(course), fixes.get("VZ", np.zeros(n))
     coarse = fixes["HDop"] * RANGE_ERROR_M
     sigma = np.stack([coarse, coarse, 1.5 * coarse, *[np.full(n, SPEED_ERROR_MS)] * 3], axis=1)
-    stated = [next((name for name in names if name in accuracy), "") for names in (("HAcc", "hAcc"), ("VAcc", "vAcc"), ("SAcc", "sAcc"))]
-    if all(stated) and len(accuracy["us"]):
-        right = np.clip(np.searchsorted(accuracy["us"], us), 1, max(1, len(accuracy["us"]) - 1)) % len(accuracy["us"])
-        nearest = np.where(np.abs(us - accuracy["us"][right - 1]) < np.abs(us - accuracy["us"][right]), right - 1, right)
-        h, v, s = (accuracy[name][nearest] for name in stated)
-        near = (np.abs(us - accuracy["us"][nearest]) < 1e6) & (h > 0.0) & (v > 0.0) & (s > 0.0)
-        sigma[near] = np.stack([h, h, v, s, s, s], axis=1)[near]
+    h, v, s = (_stated(accuracy, name, us) for name in ("HAcc", "VAcc", "SAcc"))
+    known = (h > 0.0) & (v > 0.0) & (s > 0.0)
+    sigma[known] = np.stack([h, h, v, s, s, s], axis=1)[known]
     at = us * 1e-6 - _parameter(parameters, _DELAY_MS) * 1e-3
     return aiding_rows(at, Kind.GNSS, np.stack([lat, lon, height, *velocity], axis=1), sigma, source), us
+
+
+def _stated(accuracy: _Columns, name: str, us: FloatArray) -> FloatArray:
+    """What the receiver states nearest to the times `us`; 0 where there is nothing within a second."""
+    values = accuracy.get(name, accuracy.get(name[0].lower() + name[1:]))  # UBX3 writes hAcc
+    if values is None:
+        return np.zeros(len(us))
+    times = accuracy["us"]
+    right = np.searchsorted(times, us).clip(0, len(times) - 1)
+    left = (right - 1).clip(0)
+    nearest = np.where(us - times[left] < times[right] - us, left, right)
+    return np.where(np.abs(us - times[nearest]) < 1e6, values[nearest], 0.0)

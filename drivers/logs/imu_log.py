@@ -96,7 +96,9 @@ def make_log(
     if len(time_us) < 2:
         raise HilError("it has no inertial samples")
     period_us = int(np.median(np.diff(time_us)))
-    fits = (np.abs(rate) * period_us * 1e-6 < LARGEST_TURN).all(1) & (np.abs(force) * period_us * 1e-6 < LARGEST_PUSH).all(1)
+    fits = (np.abs(rate) * period_us * 1e-6 < LARGEST_TURN).all(1) & (
+        np.abs(force) * period_us * 1e-6 < LARGEST_PUSH
+    ).all(1)
     time_us, rate, force = time_us[fits], rate[fits], force[fits]
     norm = np.linalg.norm(attitude, axis=1)
     right = steady(attitude_us) & (np.abs(norm - 1.0) < 1e-2)

@@ -1,8 +1,8 @@
 """PX4 ULog (`.ulg`) through pyulog (extra ``logs``): the board's sensors and the autopilot's own attitude.
 
-Inertial samples are `sensor_combined`, whose rates and forces are means over the sample. What aids: satellite fixes, magnetometer,
-barometer, each at the time at which it was true: the time stamp less the delay that the autopilot's own filter takes for it.
-Standard deviations are those that the receiver states; the others are those of the autopilot's filter.
+Inertial samples are `sensor_combined`, whose rates and forces are means over the sample. What aids is satellite fixes,
+magnetometer and barometer, each at the time at which it was true: its time stamp less the delay that the autopilot's own filter
+takes for it. Standard deviations are those that the receiver states; the others are those of the autopilot's filter.
 """
 
 from collections.abc import Mapping
@@ -114,8 +114,7 @@ def _spoken(imu: _Data, sensor: str) -> tuple[_Data, IntArray]:
 
 
 def _at(times: IntArray, delay_ms: float) -> FloatArray:
-    at: FloatArray = times * 1e-6 - delay_ms * 1e-3
-    return at
+    return np.asarray(times * 1e-6 - delay_ms * 1e-3, float)
 
 
 def _fixes(data: _Data, source: int, said: Mapping[str, float]) -> _Measured:
