@@ -45,6 +45,7 @@ _SENSORS = {
     "accuracy": ("GPA", "GPA2", "UBX3"),
 }
 """Messages of each sensor; the place is the number of a sensor whose message does not say it."""
+_LONGEST_US = 1e15
 _DELAY_MS = (("EKF_POS_DELAY", "EK2_GPS_DELAY", "GPS_DELAY_MS", "GPS1_DELAY_MS"), 200.0)
 _MAG_NOISE = (("EK3_MAG_M_NSE", "EK2_MAG_M_NSE", "EKF_MAG_NOISE"), 0.05)  # Gs
 _BARO_NOISE = (("EK3_ALT_M_NSE", "EK2_ALT_M_NSE", "EKF_ALT_NOISE"), 2.0)  # m
@@ -71,21 +72,22 @@ def read_dataflash(path: Path, undulation: Undulation) -> ImuLog:
         The file cannot be read or is no DataFlash log, or it lacks inertial samples or an attitude.
     """
     messages, parameters = _read(path)
+    try:
+        return _log(messages, parameters, undulation)
+    except KeyError as error:
+        raise HilError(f"log {path}: a message lacks its column {error}") from error
+    except HilError as error:
+        raise HilError(f"log {path}: {error}") from error
+
+
+def _log(messages: Mapping[str, _Columns], parameters: Mapping[str, float], undulation: Undulation) -> ImuLog:
     imu = _of(messages, ("IMU",)).get(0, {})
     attitudes = (_of(messages, (name,)) for name in _ATTITUDES)
     attitude = next((found[min(found)] for found in attitudes if found and len(found[min(found)]["us"]) > 1), {})
     if len(imu.get("us", ())) < 2 or not attitude:
-        raise HilError(f"log {path}: it has no IMU with samples, or no attitude of the autopilot (ATT)")
-    fixes = _of(messages, _SENSORS["GPS"])
-    slope = _clock_slope(fixes.get(0, {}))
-    origin = int(imu["us"][0])
-
-    def true_us(us: FloatArray) -> IntArray:
-        return np.rint(origin + (us - origin) * slope).astype(np.int64)
-
-    time_us, rate, force = _samples(imu)
+        raise HilError("it has no IMU with samples, or no attitude of the autopilot (ATT)")
     measured: list[_Measured] = []
-    accuracies = _of(messages, _SENSORS["accuracy"])
+    fixes, accuracies = _of(messages, _SENSORS["GPS"]), _of(messages, _SENSORS["accuracy"])
     for source, columns in fixes.items():
         measured.append(_fixes(columns, accuracies.get(source, {}), source, parameters, undulation))
     for source, columns in _of(messages, _SENSORS["MAG"]).items():
@@ -96,24 +98,30 @@ def read_dataflash(path: Path, undulation: Undulation) -> ImuLog:
         sigma = [_parameter(parameters, _BARO_NOISE)]
         rows = aiding_rows(columns["us"] * 1e-6, Kind.BARO, _stack(columns, "Alt"), sigma, source)
         measured.append((rows, columns["us"]))
+    slope, origin = _clock_slope(fixes.get(0, {})), float(imu["us"][0])
+
+    def true_us(us: FloatArray) -> IntArray:
+        return np.rint(origin + (us - origin) * slope).astype(np.int64)
+
     for rows, _ in measured:
         rows["time"] = (origin + (rows["time"] * 1e6 - origin) * slope) * 1e-6
-    try:
-        return make_log(
-            true_us(time_us),
-            rate,
-            force,
-            true_us(attitude["us"]),
-            quaternion_from_euler(*np.radians([attitude["Yaw"], attitude["Pitch"], attitude["Roll"]])),
-            [(rows, true_us(arrivals)) for rows, arrivals in measured],
-        )
-    except HilError as error:
-        raise HilError(f"log {path}: {error}") from error
+    time_us, rate, force = _samples(imu)
+    return make_log(
+        true_us(time_us),
+        rate,
+        force,
+        true_us(attitude["us"]),
+        quaternion_from_euler(*np.radians([attitude["Yaw"], attitude["Pitch"], attitude["Roll"]])),
+        [(rows, true_us(arrivals)) for rows, arrivals in measured],
+    )
 
 
 def _read(path: Path) -> tuple[dict[str, _Columns], dict[str, float]]:
     """Columns of each message that is wanted, by its name, and the parameters."""
     from pymavlink.DFReader import DFReader_binary
+
+    class Reader(DFReader_binary):  # type: ignore[misc]
+        init_arrays_fast = DFReader_binary.init_arrays  # the fast one is in C, and prints past our ears
 
     wanted = {"IMU", "PARM", *_ATTITUDES, *(name for names in _SENSORS.values() for name in names)}
     found: dict[str, dict[str, list[float]]] = {}
@@ -122,7 +130,7 @@ def _read(path: Path) -> tuple[dict[str, _Columns], dict[str, float]]:
     try:
         path.open("rb").close()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            reader = DFReader_binary(str(path))
+            reader = Reader(str(path))
             while (message := reader.recv_match(type=wanted)) is not None:
                 fields = message.to_dict()
                 name = fields.pop("mavpackettype")
@@ -158,7 +166,9 @@ def _of(messages: Mapping[str, _Columns], names: tuple[str, ...]) -> dict[int, _
             instance = np.full(len(next(iter(columns.values()))), float(place if name not in {"GPA", "UBX3"} else 0))
         us = _board_us(columns)
         for number in np.unique(instance[np.isfinite(instance)]).astype(int).tolist():
-            rows = (instance == number) & np.isfinite(us)
+            rows = (instance == number) & (np.abs(us) < _LONGEST_US)
+            for values in columns.values():
+                rows &= np.isfinite(values) | np.isnan(values).all()  # what is not a number at all is a text
             rows[rows] = steady(us[rows].astype(np.int64))
             if rows.any() and number not in split:
                 split[number] = {**{key: values[rows] for key, values in columns.items()}, "us": us[rows]}

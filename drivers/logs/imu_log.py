@@ -125,8 +125,9 @@ def make_log(
 
 def steady(time_us: IntArray) -> NDArray[np.bool_]:
     """Which times go on from those before: later, and no lone leap (a damaged record) of more than a second."""
-    padded = np.pad(time_us, 2, mode="edge")
-    median = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1) if len(time_us) else time_us
-    near = np.abs(time_us - median) <= 1_000_000
+    near = np.ones(len(time_us), np.bool_)
+    if len(time_us) >= 3:
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(time_us, 2, mode="reflect"), 5)
+        near = np.abs(time_us - np.median(around, axis=1)) <= 1_000_000
     good: NDArray[np.bool_] = np.diff(np.maximum.accumulate(np.where(near, time_us, -1)), prepend=-1) > 0
     return good
