@@ -1,4 +1,4 @@
-"""Aiding on CAN: rows come back to the resolution of the wire, every fault of a wire is counted, the head's driver is not disturbed."""
+"""Aiding on CAN: rows come back to the resolution of the wire, its faults are counted, the head's driver is not disturbed."""
 
 import math
 
