@@ -1,10 +1,11 @@
 """The loop: frames in, solutions into the ring. It owns its process, blocks on the bus only, and never formats or logs.
 
     source -> driver -> head compensation -> navigator -> lever arm -> ring (publisher, status line, dashboard)
-                                                                 \\-> frames ring (recorder)
+         \\-> aiding (decoded, kept)                              \\-> frames ring (recorder)
 
-Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched. What the loop does on
-its own account (silence, an ordered alignment) goes into the recording as an event, so that a replay repeats it.
+Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched: a measurement is taken
+between the samples between which it came. What the loop does on its own account (silence, an ordered alignment) goes into the
+recording as an event, so that a replay repeats it.
 """
 
 import gc
@@ -12,6 +13,7 @@ import hashlib
 import math
 import signal
 import time
+from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import FrameDriver, make_driver
+from drivers.can.aiding import AidingDecoder, is_aiding
 from drivers.can.frames import FrameArray, frames
 from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
@@ -42,8 +45,12 @@ from nav.state import HOST_FIELDS, NAV_STATE
 
 BATCH = 1024
 """Most frames taken at once."""
+AIDING_KEPT = 1024
+"""Most measurements that wait for the navigator; the oldest go first."""
 TICK_S = 0.02
 """Longest wait for a frame."""
+AIDING_FAULTS = ("lost", "duplicated", "crc_errors", "foreign", "short", "version_errors", "restarts")
+"""Counters of aiding frames that the summary shows."""
 EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
 """A message for the user, as it lies in the ring of events."""
 
@@ -126,6 +133,11 @@ class Loop:
         self.navigator = Navigator(settings_of(scenario))
         self.finished = False
         """The scenario's duration is over."""
+        self.aided: deque[np.void] = deque(maxlen=AIDING_KEPT)
+        """Measurements that aid the navigator (`AIDING`), in the order in which they came."""
+        self._aiding = AidingDecoder()
+        self._now: float | None = None
+        """Device time of the newest sample."""
         self._combiner = HeadCombiner(head_model(scenario.head))
         self._calibrated = None if scenario.head.calibration is None else int(scenario.head.calibration["serial"])
         self._outlets = outlets
@@ -150,9 +162,25 @@ class Loop:
         """Decode and navigate a batch of frames; True when it held a sample."""
         driver, got, start = self.driver, False, 0
         while driver.period_s is None and start < len(batch):  # one by one until the board has said what it is
-            got = self._take(batch[start : start + 1]) or got
+            got = self._between(batch[start : start + 1]) or got
             start += 1
-        return (self._take(batch[start:]) if start < len(batch) else False) or got
+        return self._between(batch[start:]) or got
+
+    def _between(self, batch: FrameArray) -> bool:
+        """Take frames, the measurements among them in their place between the samples."""
+        aided = is_aiding(batch["can_id"])
+        if not aided.any():
+            return len(batch) > 0 and self._take(batch)
+        rows, places = self._aiding.decode(batch, self._now)
+        cuts = np.flatnonzero(aided[1:] & ~aided[:-1]) + 1
+        got, start, taken = False, 0, 0
+        for stop in (*cuts.tolist(), len(batch)):
+            end = int(np.searchsorted(places, stop))
+            if end > taken:
+                self.aided.extend(rows[taken:end])
+            got = self._take(batch[start:stop]) or got
+            start, taken = stop, end
+        return got
 
     def _take(self, batch: FrameArray) -> bool:
         driver = self.driver
@@ -160,6 +188,7 @@ class Loop:
         if len(raw) == 0:
             self._count()
             return False
+        self._now = float(raw.time[-1])
         arrivals, start = driver.arrivals(), 0
         if driver.counters.restarts != self._restarts:  # its clock begins anew, maybe in the middle of the batch
             self._restarts = driver.counters.restarts
@@ -296,7 +325,11 @@ class Loop:
             "gyro_bias_deg_h": [float(b) for b in np.degrees(self.navigator.gyro_bias) * 3600.0],
             "head": self.driver.identity(),
             "failed_axes": self._combiner.failed(),
+            "aiding": {kind.name: count for kind, count in self._aiding.heard.items() if count},
         }
+        if self._aiding.counters.frames:
+            faults = self._aiding.counters.as_dict()
+            result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
         if self._trace is not None and self._reference is not None:

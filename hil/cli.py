@@ -107,7 +107,7 @@ def imu(
 
 @app.command()
 def replay(
-    log: Annotated[Path, typer.Argument(help="Our recording, PX4 .ulg, candump .log, .blf, .asc.")],
+    log: Annotated[Path, typer.Argument(help="Our recording, PX4 .ulg, ArduPilot .bin, candump .log, .blf, .asc.")],
     scenario: Annotated[str | None, typer.Option(help="Scenario instead of the one in the recording.")] = None,
     bus: Bus = None,
     mavlink: Links = None,

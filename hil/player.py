@@ -3,20 +3,24 @@
 import math
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drivers.can.aiding import AidingEncoder, merge
 from drivers.can.bus import open_port
 from drivers.can.dtg_head_emulator import REPLAY, HeadEncoder
 from drivers.can.frames import FrameArray, frames
+from drivers.logs.dataflash import read_dataflash
+from drivers.logs.imu_log import ImuLog
 from drivers.logs.recording import RecordingReader
-from drivers.logs.ulog import ImuLog, read_ulog
+from drivers.logs.ulog import read_ulog
 from hil.bridge import LoopOrder
 from hil.control import Control
+from hil.geoid import undulation
 from hil.pacing import Pacer
 from hil.reference import Reference, interpolate_attitude
 from hil.scenario import Scenario, load, validated
@@ -29,6 +33,11 @@ ALIGN_S = 1.5
 """Averaging time at the start of a log of a board that cannot gyrocompass."""
 SLOW_S = 1.0
 CHUNK = 256
+_IMU_LOGS: dict[str, Callable[[Path], ImuLog]] = {
+    ".ulg": read_ulog,
+    ".bin": lambda path: read_dataflash(path, undulation),
+}
+"""Readers of flight logs by file ending."""
 
 
 def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced: bool) -> tuple[LoopOrder, bool]:
@@ -42,8 +51,9 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
     HilError
         The file cannot be read or is of no kind that is known.
     """
-    if path.suffix.lower() == ".ulg":
-        log = read_ulog(path)
+    suffix = path.suffix.lower()
+    if suffix in _IMU_LOGS and not is_own(path):
+        log = _IMU_LOGS[suffix](path)
         scenario = load(scenario_file) if scenario_file else _board_scenario(path, log)
         reference = Reference(
             time=np.asarray(log.attitude_us * 1e-6, float),
@@ -54,14 +64,16 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         )
         scenario = scenario.with_changes(bus=bus or f"unix:replay-{time.monotonic_ns():x}")
         return LoopOrder(scenario, paced=paced, reference=reference), True
-    if path.suffix.lower() == ".dhil" or is_own(path):
+    if suffix == ".dhil" or is_own(path):
         reader = RecordingReader.open(path)
         reader.close()
         scenario = load(scenario_file) if scenario_file else _recorded_scenario(path, reader.header)
-    elif path.suffix.lower() in {".log", ".blf", ".asc", ".trc", ".csv"}:
+    elif suffix in {".log", ".blf", ".asc", ".trc", ".csv"}:
         scenario = load(scenario_file).with_changes(duration_s=None)
     else:
-        raise HilError(f"replay {path}: unknown kind; there is: our own recordings, .ulg, candump .log, .blf, .asc")
+        raise HilError(
+            f"replay {path}: unknown kind; there is: our own recordings, .ulg, .bin, candump .log, .blf, .asc"
+        )
     if bus is not None:
         return LoopOrder(scenario.with_changes(bus=bus), paced=paced), True
     return LoopOrder(scenario, file=path, paced=paced), False
@@ -75,10 +87,17 @@ def _recorded_scenario(path: Path, header: dict[str, Any]) -> Scenario:
 
 
 def _board_scenario(path: Path, log: ImuLog) -> Scenario:
-    """For a board that cannot gyrocompass: level at the start, heading from the log's own estimate, bias kept at rest."""
+    """For a board that cannot gyrocompass: level at the start, bias kept at rest.
+
+    The heading is the log's own estimate, the place that of the first fix.
+    """
     times = np.asarray(log.attitude_us * 1e-6, float)
     at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
     heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])
+    start = {"heading_deg": math.degrees(heading)}
+    if log.place is not None:
+        lat, lon, height = log.place
+        start |= {"latitude_deg": math.degrees(lat), "longitude_deg": math.degrees(lon), "height_m": height}
     return Scenario.model_validate(
         {
             "name": path.stem,
@@ -86,7 +105,7 @@ def _board_scenario(path: Path, log: ImuLog) -> Scenario:
             "navigation": {
                 "alignment": "level",
                 "align_s": ALIGN_S,
-                "start": {"heading_deg": math.degrees(heading)},
+                "start": start,
                 "track_bias_at_rest": True,
             },
         }
@@ -119,8 +138,8 @@ def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _:
 
 def _timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]]:
     """(seconds from the start, frames) of a recording."""
-    if path.suffix.lower() == ".ulg":
-        yield from _head_frames(read_ulog(path), 1 if one_by_one else CHUNK)
+    if path.suffix.lower() in _IMU_LOGS and not is_own(path):
+        yield from _head_frames(_IMU_LOGS[path.suffix.lower()](path), 1 if one_by_one else CHUNK)
         return
     source = FileSource(path, paced=False)
     batch = frames(CHUNK)
@@ -135,10 +154,11 @@ def _timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]
 
 
 def _head_frames(log: ImuLog, chunk: int) -> Iterator[tuple[float, FrameArray]]:
-    """The samples of an IMU log as frames of a head."""
+    """The samples of an IMU log as frames of a head; what aids stands behind the first sample that is not older."""
     encoder = HeadEncoder("fd", log.period_us, hardware=REPLAY)
     step_s = (log.step_us * 1e-6)[:, None]
     dtheta, dvel = (log.rate * step_s)[:, (0, 1, 1, 2)], log.force * step_s
+    aiding, behind = AidingEncoder().frames(log.aiding), np.searchsorted(log.time_us, log.arrival_us)
     next_slow = 0
     for first in range(0, len(log.time_us), chunk):
         part = slice(first, first + chunk)
@@ -146,4 +166,5 @@ def _head_frames(log: ImuLog, chunk: int) -> Iterator[tuple[float, FrameArray]]:
         if log.time_us[first] >= next_slow:
             next_slow = int(log.time_us[first]) + round(SLOW_S * 1e6)
             yield due, encoder.slow()
-        yield due, encoder.samples(log.counter[part], log.time_us[part], dtheta[part], dvel[part])
+        samples = encoder.samples(log.counter[part], log.time_us[part], dtheta[part], dvel[part])
+        yield due, merge(samples, aiding, behind - first)

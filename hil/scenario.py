@@ -20,6 +20,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
+PositiveVector = tuple[Positive, Positive, Positive]
 
 
 class _Model(BaseModel):
@@ -152,6 +153,98 @@ class HeadConfig(_Model):
         return value
 
 
+class Outage(_Model):
+    """A time without a measurement."""
+
+    start_s: NotNegative
+    end_s: Positive
+
+
+class Jump(_Model):
+    """A step of the error, from `at_s` on."""
+
+    at_s: NotNegative
+    size: Finite
+
+
+class VectorJump(_Model):
+    """A step of the error of three axes, from `at_s` on."""
+
+    at_s: NotNegative
+    size: Vector
+
+
+class GnssJump(VectorJump):
+    """A step of the position, north, east, down, m, and what it grows by: a spoofed receiver."""
+
+    drift_ms: Vector = (0.0, 0.0, 0.0)
+
+
+class AidConfig(_Model):
+    """What all simulated sensors that aid the navigator have."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 5.0
+    delay_s: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """A measurement arrives so long after it was true."""
+    claim: Positive = 1.0
+    """Standard deviation that the sensor states, over that of its noise."""
+    outages: tuple[Outage, ...] = ()
+
+
+class GnssConfig(AidConfig):
+    """A satellite receiver: position and velocity of its antenna."""
+
+    position_sigma_m: PositiveVector = (1.5, 1.5, 3.0)
+    velocity_sigma_ms: PositiveVector = (0.05, 0.05, 0.1)
+    bias_sigma_m: NotNegative = 0.0
+    """A first-order Gauss-Markov error of each axis of the position, which the stated deviation leaves out."""
+    bias_time_s: Positive = 300.0
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """Place of the antenna in the body, forward-right-down of the navigated point."""
+    jumps: tuple[GnssJump, ...] = ()
+
+
+class BaroConfig(AidConfig):
+    """A barometer: height, with an offset that drifts."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 10.0
+    sigma_m: Positive = 0.3
+    offset_m: Finite = 0.0
+    bias_sigma_m: NotNegative = 2.0
+    bias_time_s: Positive = 600.0
+    jumps: tuple[Jump, ...] = ()
+
+
+class MagnetometerConfig(AidConfig):
+    """A magnetometer along the body axes."""
+
+    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 25.0
+    sigma_ut: Positive = 0.3
+    hard_iron_ut: Vector = (0.0, 0.0, 0.0)
+    jumps: tuple[VectorJump, ...] = ()
+
+
+class HeadingConfig(AidConfig):
+    """Two antennas: true heading."""
+
+    sigma_deg: Positive = 0.2
+    offset_deg: Finite = 0.0
+    jumps: tuple[Jump, ...] = ()
+
+
+class AidingConfig(_Model):
+    """What the simulated world sends besides the head, on the same bus."""
+
+    gnss: tuple[GnssConfig, ...] = ()
+    baro: tuple[BaroConfig, ...] = ()
+    magnetometer: tuple[MagnetometerConfig, ...] = ()
+    heading: tuple[HeadingConfig, ...] = ()
+    field: Literal["dipole", "wmm"] = "dipole"
+    """The Earth's magnetic field: a centred dipole, or the World Magnetic Model."""
+    year: Annotated[float, Field(ge=2025, le=2030)] = 2026.0
+    """Of the World Magnetic Model."""
+
+
 class StartConfig(_Model):
     """A known start; what is left out comes from the alignment or from the motion's truth."""
 
@@ -205,8 +298,16 @@ class Scenario(_Model):
     driver: str = "dtg-head"
     motion: MotionConfig = MotionConfig()
     head: HeadConfig = HeadConfig()
+    aiding: AidingConfig = AidingConfig()
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
+
+    @model_validator(mode="after")
+    def _carried(self) -> "Scenario":
+        aiding = self.aiding
+        if self.head.layout == "classic" and (aiding.gnss or aiding.baro or aiding.magnetometer or aiding.heading):
+            raise ValueError('simulated aiding needs CAN FD: head.layout = "fd"')
+        return self
 
     def with_changes(self, **changes: Any) -> "Scenario":
         """A copy with `changes` laid over it (nested dictionaries reach nested keys), validated anew."""

@@ -38,7 +38,7 @@ RECORDER_STOP_S = 60.0
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
 DRAIN_S = 1.0
-"""Time for the loop to take what is on its way when the feeder has ended."""
+"""Time for the loop to take what is on its way when the feeder has ended; as fast as it goes, time without a new frame."""
 
 _Answers = dict[str, Any]
 
@@ -91,6 +91,8 @@ class Session:
         self._event_number = 0
         self._row = np.zeros(1, NAV_STATE)
         self._feeder_ended: float | None = None
+        self._drained = 0
+        """Frames that the loop had taken when it was last seen at work after the feeder's end."""
         self._began = 0.0
         self._ended = 0.0
         self.problems: list[str] = []
@@ -176,7 +178,9 @@ class Session:
             return True
         feeder = self._parts.get("feeder")
         if feeder is not None and not feeder.process.is_alive():
-            self._feeder_ended = self._feeder_ended or time.monotonic()
+            frames = self.outlets.stats["frames"]
+            if self._feeder_ended is None or (not self.order.paced and frames != self._drained):
+                self._feeder_ended, self._drained = time.monotonic(), frames
             if time.monotonic() - self._feeder_ended > DRAIN_S:
                 self.stop()
         return self.outlets.stats["phase"] in (Phase.READY, Phase.RUNNING) and not self.outlets.control.stop

@@ -22,6 +22,7 @@ def _miniature(scenario: Scenario) -> Scenario:
             "bus": "unix:none",
             "duration_s": 1.5,
             "head": head,
+            "aiding": scenario.aiding.model_dump(),
             "motion": {"rest_s": 1.0, "ramp_s": 0.5, "north": {"rate": 1.0}},
             "navigation": {"align_s": 0.5},
         }

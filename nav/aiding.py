@@ -7,6 +7,7 @@ standard deviation. Times are device times of the inertial sensor, s, at which t
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 
 class Kind(IntEnum):
@@ -49,3 +50,26 @@ def aiding(time: float, kind: Kind, value: tuple[float, ...], sigma: tuple[float
     row["value"][0, : len(value)], row["sigma"][0, : len(sigma)] = value, sigma
     result: np.void = row[0]
     return result
+
+
+def aiding_rows(
+    times: ArrayLike, kind: Kind, values: ArrayLike, sigmas: ArrayLike, source: int = 0
+) -> NDArray[np.void]:
+    """Rows of `AIDING`.
+
+    Parameters
+    ----------
+    times : (n,) array_like
+        Device times, s.
+    kind : Kind
+        What all of them measure.
+    values, sigmas : (n, m) or (m,) array_like
+        As in `Kind`; what is left out of them is zero and infinite.
+    source : int
+        Number of the receiver or sensor.
+    """
+    values, sigmas = np.atleast_2d(np.asarray(values, float)), np.atleast_2d(np.asarray(sigmas, float))
+    rows = np.zeros(np.size(times), AIDING)
+    rows["time"], rows["kind"], rows["source"], rows["sigma"] = times, kind, source, np.inf
+    rows["value"][:, : values.shape[1]], rows["sigma"][:, : sigmas.shape[1]] = values, sigmas
+    return rows

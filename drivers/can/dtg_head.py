@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import Counters
+from drivers.can.aiding import is_aiding
 from drivers.can.codec import MessageCodec, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
 from drivers.can.integrity import Protection, protection
@@ -221,7 +222,7 @@ class DtgHead:
         if is_sample.all():
             self._data[:n] = batch["data"]
             return self._samples(n, batch["time_ns"], said)
-        self._others(batch, np.flatnonzero(~is_sample), said)
+        self._others(batch, np.flatnonzero(~(is_sample | is_aiding(ids))), said)
         chosen = batch[is_sample]
         if len(chosen):
             self._data[: len(chosen)] = chosen["data"]

@@ -1,55 +1,47 @@
-"""PX4 ULog (`.ulg`): the IMU of a flight board and the autopilot's own attitude, through pyulog (extra ``logs``)."""
+"""PX4 ULog (`.ulg`) through pyulog (extra ``logs``): the board's sensors and the autopilot's own attitude.
 
-from dataclasses import dataclass
+Inertial samples are `sensor_combined`, whose rates and forces are means over the sample. What aids is satellite fixes,
+magnetometer and barometer, each at the time at which it was true: its time stamp less the delay that the autopilot's own filter
+takes for it. Standard deviations are those that the receiver states; the others are those of the autopilot's filter.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from drivers.can.aiding import AidingArray
+from drivers.logs.imu_log import ImuLog, make_log
+from nav.aiding import Kind, aiding_rows
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 
-
-@dataclass(frozen=True, slots=True)
-class ImuLog:
-    """The IMU in a log, as a board would have sent it.
-
-    Attributes
-    ----------
-    time_us : (n,) int
-        Device time at the end of each sample, us.
-    counter : (n,) int
-        Sample counter: jumps where the log has gaps.
-    period_us : int
-        Nominal period: the median.
-    rate : (n, 3) float
-        Body rate, rad/s.
-    force : (n, 3) float
-        Specific force, m/s^2.
-    attitude_us : (m,) int
-        Times of the log's own attitude.
-    attitude : (m, 4) float
-        Its q_nb.
-    """
-
-    time_us: IntArray
-    counter: IntArray
-    period_us: int
-    rate: FloatArray
-    force: FloatArray
-    attitude_us: IntArray
-    attitude: FloatArray
-
-    @property
-    def step_us(self) -> IntArray:
-        """Length of each sample, us: the time since the one before, the nominal period after a gap."""
-        steps = np.diff(self.time_us, prepend=self.time_us[0] - self.period_us)
-        jumps = np.diff(self.counter, prepend=self.counter[0] - 1) != 1
-        return np.where(jumps, self.period_us, steps)
+GAUSS = 1e-4
+"""T."""
+_NEVER = 0x7FFFFFFF
+"""Relative time stamp of a sensor that has not spoken."""
+_REPEATED_US = 1000
+"""A measurement that is repeated with the next inertial sample has the same time but for rounding."""
+_DEFAULTS = {
+    "EKF2_GPS_DELAY": 110.0,  # ms
+    "EKF2_MAG_DELAY": 0.0,
+    "EKF2_BARO_DELAY": 0.0,
+    "EKF2_MAG_NOISE": 0.05,  # Gs
+    "EKF2_BARO_NOISE": 3.5,  # m
+    "EKF2_GPS_V_NOISE": 0.3,  # m/s
+}
+"""What PX4 takes where the log does not say."""
+_TOPICS = (
+    *("sensor_combined", "vehicle_attitude", "vehicle_gps_position", "sensor_gps"),
+    *("vehicle_magnetometer", "vehicle_air_data"),
+)
+_Data = Mapping[str, Any]
+_Measured = tuple[AidingArray, IntArray]
 
 
 def read_ulog(path: Path) -> ImuLog:
-    """The first IMU (`sensor_combined`) and `vehicle_attitude` of a ULog.
+    """The first IMU of a ULog, all that aids it, and `vehicle_attitude`.
 
     Raises
     ------
@@ -61,30 +53,99 @@ def read_ulog(path: Path) -> ImuLog:
     except ImportError as error:
         raise HilError("reading ULog needs pyulog: pip install 'dtg-hil[logs]'") from error
     try:
-        log = ULog(str(path), ["sensor_combined", "vehicle_attitude"])
+        log = ULog(str(path), list(_TOPICS))
     except OSError as error:
         raise HilError(f"log {path}: {error.strerror}") from error
     except Exception as error:  # pyulog raises whatever the bytes provoke
         raise HilError(f"log {path}: not a readable ULog: {error}") from error
-    topics: dict[str, Any] = {topic.name: topic.data for topic in reversed(log.data_list)}
+    topics = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
     for name in ("sensor_combined", "vehicle_attitude"):
-        if name not in topics or len(topics[name]["timestamp"]) < 2:
+        if (name, 0) not in topics or len(topics[name, 0]["timestamp"]) < 2:
             raise HilError(f"log {path}: it has no topic {name} with samples")
-    imu, attitude = topics["sensor_combined"], topics["vehicle_attitude"]
-    time_us = imu["timestamp"].astype(np.int64)
-    order = np.concatenate(([True], np.diff(time_us) > 0))
-    rate = np.stack([imu[f"gyro_rad[{i}]"] for i in range(3)], axis=1).astype(float)
-    force = np.stack([imu[f"accelerometer_m_s2[{i}]"] for i in range(3)], axis=1).astype(float)
-    good = order & np.isfinite(rate).all(1) & np.isfinite(force).all(1)
-    time_us, rate, force = time_us[good], rate[good], force[good]
-    period_us = int(np.median(np.diff(time_us)))
-    missing = np.maximum(np.rint(np.diff(time_us) / period_us).astype(np.int64), 1)
-    return ImuLog(
-        time_us=time_us,
-        counter=np.concatenate(([0], np.cumsum(missing))),
-        period_us=period_us,
-        rate=rate,
-        force=force,
-        attitude_us=attitude["timestamp"].astype(np.int64),
-        attitude=np.stack([attitude[f"q[{i}]"] for i in range(4)], axis=1).astype(float),
+    imu, attitude = topics["sensor_combined", 0], topics["vehicle_attitude", 0]
+    said = {name: float(log.initial_parameters.get(name, value)) for name, value in _DEFAULTS.items()}
+    try:
+        return make_log(
+            _times(imu),
+            _columns(imu, "gyro_rad", 3),
+            _columns(imu, "accelerometer_m_s2", 3),
+            _times(attitude),
+            _columns(attitude, "q", 4),
+            list(_measured(topics, said)),
+        )
+    except HilError as error:
+        raise HilError(f"log {path}: {error}") from error
+
+
+def _times(data: _Data) -> IntArray:
+    times: IntArray = data["timestamp"].astype(np.int64)
+    return times
+
+
+def _columns(data: _Data, name: str, count: int) -> FloatArray:
+    return np.stack([data[f"{name}[{i}]"] for i in range(count)], axis=1).astype(float)
+
+
+def _measured(topics: Mapping[tuple[str, int], _Data], said: Mapping[str, float]) -> list[_Measured]:
+    found = []
+    names = {name for name, _ in topics}
+    fixes = "vehicle_gps_position" if "vehicle_gps_position" in names else "sensor_gps"
+    for (name, source), data in topics.items():
+        if name == fixes:
+            found.append(_fixes(data, source, said))
+        elif name == "vehicle_magnetometer":
+            found.append(_magnetic(data, _times(data), source, said))
+        elif name == "vehicle_air_data":
+            found.append(_pressure(data, _times(data), source, said))
+    imu = topics["sensor_combined", 0]
+    if "magnetometer_ga[0]" in imu:  # old logs: with the inertial samples, repeated until there is a new one
+        found.append(_magnetic(*_spoken(imu, "magnetometer"), 0, said))
+    if "baro_alt_meter" in imu:
+        found.append(_pressure(*_spoken(imu, "baro"), 0, said))
+    return found
+
+
+def _spoken(imu: _Data, sensor: str) -> tuple[_Data, IntArray]:
+    """The samples that bring something new of a sensor, and its times."""
+    relative = imu[f"{sensor}_timestamp_relative"].astype(np.int64)
+    times = _times(imu) + relative
+    fresh = (relative != _NEVER) & (np.diff(np.maximum.accumulate(times), prepend=-_REPEATED_US) >= _REPEATED_US)
+    return {name: values[fresh] for name, values in imu.items()}, times[fresh]
+
+
+def _at(times: IntArray, delay_ms: float) -> FloatArray:
+    return np.asarray(times * 1e-6 - delay_ms * 1e-3, float)
+
+
+def _fixes(data: _Data, source: int, said: Mapping[str, float]) -> _Measured:
+    if "latitude_deg" in data:
+        place = [np.radians(data["latitude_deg"]), np.radians(data["longitude_deg"]), data["altitude_ellipsoid_m"]]
+    else:
+        place = [np.radians(data["lat"] * 1e-7), np.radians(data["lon"] * 1e-7), data["alt_ellipsoid"] * 1e-3]
+    velocity = [data[f"vel_{axis}_m_s"] for axis in "ned"]
+    speed_sigma = np.maximum(data["s_variance_m_s"], said["EKF2_GPS_V_NOISE"])
+    sigmas = np.stack([data["eph"], data["eph"], data["epv"], *[speed_sigma] * 3], axis=1)
+    good = data["fix_type"] >= 3
+    times = _times(data)[good]
+    rows = aiding_rows(
+        _at(times, said["EKF2_GPS_DELAY"]), Kind.GNSS, np.stack([*place, *velocity], axis=1)[good], sigmas[good], source
     )
+    return rows, times
+
+
+def _magnetic(data: _Data, times: IntArray, source: int, said: Mapping[str, float]) -> _Measured:
+    sigma = [said["EKF2_MAG_NOISE"] * GAUSS] * 3
+    flux = _columns(data, "magnetometer_ga", 3) * GAUSS
+    good = flux.any(axis=1)
+    at = _at(times, said["EKF2_MAG_DELAY"])
+    return aiding_rows(at[good], Kind.MAGNETIC, flux[good], sigma, source), _heard(data, times)[good]
+
+
+def _pressure(data: _Data, times: IntArray, source: int, said: Mapping[str, float]) -> _Measured:
+    at, sigma = _at(times, said["EKF2_BARO_DELAY"]), [said["EKF2_BARO_NOISE"]]
+    return aiding_rows(at, Kind.BARO, data["baro_alt_meter"][:, None], sigma, source), _heard(data, times)
+
+
+def _heard(data: _Data, times: IntArray) -> IntArray:
+    """When a measurement reached the autopilot: with the record that it stands in."""
+    return np.maximum(times, _times(data))

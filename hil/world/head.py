@@ -1,4 +1,5 @@
-"""The simulated sensor head: the scenario's motion through ideal instruments onto the bus, in a process of its own.
+"""The simulated sensor head: the scenario's motion through its instruments onto the bus, in a process of its own. What else the
+simulated world measures goes out between the samples.
 
 The frames depend on the scenario alone: the same scenario gives the same bytes at any speed.
 """
@@ -11,6 +12,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
+from drivers.can.aiding import AidingEncoder, is_aiding, merge
 from drivers.can.bus import Port, open_port
 from drivers.can.dtg_head_emulator import SIMULATED, HeadEncoder
 from drivers.can.frames import FrameArray, frames
@@ -19,6 +21,7 @@ from hil.pacing import Pacer
 from hil.scenario import Scenario
 from hil.stats import Stats
 from hil.warmup import warm_head
+from hil.world.aiding import SimulatedAiding
 from hil.world.instruments import instruments
 from nav.errors import HilError
 
@@ -27,7 +30,7 @@ CHUNK_S = 0.1
 
 
 class SimulatedHead:
-    """Frames of the head of a scenario."""
+    """Frames of the head of a scenario, and of what aids the navigator."""
 
     def __init__(self, scenario: Scenario) -> None:
         head = scenario.head
@@ -43,11 +46,15 @@ class SimulatedHead:
             hardware=SIMULATED,
             rotor_hz=head.rotor.spin_hz,
         )
+        self._aiding, self._aiding_encoder = SimulatedAiding(scenario), AidingEncoder()
         self._slow_every = max(1, round(1.0 / self.step))
         self._chunk = max(1, min(self._slow_every, round(CHUNK_S / self.step)))
 
     def chunks(self, samples: int | None) -> Iterator[tuple[int, FrameArray, FrameArray]]:
-        """(number of the first sample, slow frames before it, frames of its samples), until `samples` are out."""
+        """(number of the first sample, slow frames before it, frames of its samples), until `samples` are out.
+
+        A measurement stands behind the first sample that ends when it arrives, or later.
+        """
         first = 0
         while samples is None or first < samples:
             until_slow = self._slow_every - first % self._slow_every
@@ -59,9 +66,13 @@ class SimulatedHead:
     def _samples(self, first: int, count: int) -> FrameArray:
         sensed = self._instruments.sense(first, count)
         counter = np.arange(first, first + count)
-        return self._encoder.samples(
-            counter, (counter + 1) * self.period_us, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor
-        )
+        ends = (counter + 1) * self.period_us
+        batch = self._encoder.samples(counter, ends, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
+        rows, arrivals = self._aiding.arrived(int(ends[-1]))
+        if len(rows) == 0:
+            return batch
+        frames_of_rows = self._aiding_encoder.frames(rows)
+        return merge(batch, frames_of_rows, np.searchsorted(ends, arrivals), self.frames_per_sample)
 
 
 def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool, cancelled: Callable[[], bool]) -> int:
@@ -72,16 +83,17 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
     for first, slow, batch in head.chunks(samples):
         if cancelled():
             break
+        starts = np.flatnonzero(~is_aiding(batch["can_id"]))[::k]
         if not paced:
             port.send(np.concatenate([slow, batch]))
-            sent += len(batch) // k
+            sent += len(starts)
             continue
         if len(slow):
             port.send(slow)
-        for i in range(len(batch) // k):
+        for i, piece in enumerate(np.split(batch, starts[1:])):
             if not pacer.wait((first + i + 1) * head.step, cancelled):
                 return sent
-            port.send(batch[i * k : (i + 1) * k])
+            port.send(piece)
             sent += 1
     return sent
 

@@ -184,7 +184,12 @@ def test_damaged_header_is_refused(recorded: tuple[Path, dict[str, Any]], tmp_pa
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [
-        ("x.bin", b"something else", "unknown kind; there is: our own recordings, .ulg, candump .log, .blf, .asc"),
+        (
+            "x.dat",
+            b"something else",
+            "unknown kind; there is: our own recordings, .ulg, .bin, candump .log, .blf, .asc",
+        ),
+        ("x.bin", b"something else", "not a readable DataFlash log"),
         ("x.dhil", b"something else", "not a recording of ours at offset 0"),
         ("x.ulg", b"something else", "not a readable ULog"),
         ("x.log", b"something else\n", "no frames in it"),
@@ -244,8 +249,26 @@ def test_a_flight_board(hil_data: Path) -> None:
     assert summary["feeder"]["dropped"] == 0
     assert summary["lost"] > 0, "the log has gaps"
     assert summary["interpolated"] > 0
+    assert summary["aiding"]["MAGNETIC"] > 1000
+    assert not any(summary["aiding_faults"].values())
     again, _ = replay(hil_data / "px4_board.ulg", "--speed", "max")
     assert again["navigation_digest"] == summary["navigation_digest"]
+
+
+def test_a_flight(hil_data: Path, tmp_path: Path) -> None:
+    """ArduPilot's own attitude against ours from its 50 Hz IMU alone: no worse than the raw gyro; what aids it comes along."""
+    file = tmp_path / "flight.dhil"
+    summary, _ = replay(hil_data / "ardupilot_copter.bin", "--speed", "max", "--record", file)
+    difference, baseline = summary["difference"]["total_deg"], summary["baseline"]["total_deg"]
+    print(f"difference {summary['difference']}, plain integration {baseline}")
+    assert difference["rms"] <= 1.1 * baseline["rms"]
+    assert summary["device_s"] > 360.0
+    assert summary["lost"] == summary["foreign"] == summary["feeder"]["dropped"] == 0
+    assert summary["aiding"].keys() == {"GNSS", "BARO", "MAGNETIC"}
+    assert not any(summary["aiding_faults"].values())
+    assert summary["frames"] == summary["feeder"]["sent"], "all of it, though the player ended long before the loop"
+    again, _ = replay(file, "--speed", "max")
+    assert (again["aiding"], again["navigation_digest"]) == (summary["aiding"], summary["navigation_digest"])
 
 
 def test_plot_needs_an_attitude_to_compare_with(recorded: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:

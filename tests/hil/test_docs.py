@@ -13,6 +13,7 @@ import typer
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from drivers.can.aiding import aiding_database_text
 from drivers.can.codec import load_database
 from drivers.can.dtg_head import head_database_text
 from drivers.can.integrity import protection
@@ -113,7 +114,8 @@ def test_documented_message_rates_are_the_table() -> None:
 def test_documented_frames_are_the_dbc() -> None:
     documented = {cells[0].strip("`"): tuple(cells[1:5]) for cells in table_rows(DOCS / "can.md", 6)}
     expected = {}
-    for message in load_database(head_database_text()).by_id.values():
+    databases = load_database(head_database_text()), load_database(aiding_database_text())
+    for message in [message for database in databases for message in database.by_id.values()]:
         declared = protection(message)
         assert declared is not None
         expected[message.name] = (

@@ -1,10 +1,16 @@
-"""ULog of a real flight board, and files that are none."""
+"""ULog of a real flight board, logs made here, and files that are none."""
+
+import math
+import struct
 
 import numpy as np
 import pytest
 
-from drivers.logs.ulog import ImuLog, read_ulog
+from drivers.logs.imu_log import ImuLog, steady
+from drivers.logs.ulog import read_ulog
+from nav.aiding import AIDING, Kind
 from nav.errors import HilError
+from nav.rotation import rotated
 
 pytest.importorskip("pyulog", reason="reading ULog needs the extra 'logs'")
 
@@ -38,7 +44,8 @@ def test_a_real_board(flight):
 
 def test_step_of_a_log_with_a_gap():
     time_us = np.array([1000, 2000, 3010, 8000, 9000])
-    log = ImuLog(time_us, np.array([0, 1, 2, 7, 8]), 1000, *[np.zeros((5, 3))] * 2, np.zeros(0, int), np.zeros((0, 4)))
+    nothing = np.zeros(0, int), np.zeros((0, 4)), np.zeros(0, AIDING), np.zeros(0, int)
+    log = ImuLog(time_us, np.array([0, 1, 2, 7, 8]), 1000, *[np.zeros((5, 3))] * 2, *nothing)
     assert log.step_us.tolist() == [1000, 1000, 1010, 1000, 1000]
 
 
@@ -67,3 +74,124 @@ def test_foreign_files(tmp_path, content):
 def test_missing_file(tmp_path):
     with pytest.raises(HilError, match="No such file"):
         read_ulog(tmp_path / "none.ulg")
+
+
+def test_the_boards_magnetometer(flight):
+    """Its own times, 5 to 20 ms before the samples that it came with; the strength of the Earth's field."""
+    log = read_ulog(flight)
+    assert set(log.aiding["kind"].tolist()) == {Kind.MAGNETIC}, "barometer and position of this log are empty"
+    assert (np.diff(log.aiding["time"]) > 0).all()
+    assert (log.arrival_us * 1e-6 >= log.aiding["time"]).all()
+    strength = np.linalg.norm(log.aiding["value"][:, :3], axis=1)
+    assert 20e-6 < strength.min() < strength.max() < 70e-6
+    # Turned into the level by the log's attitude it stands still: axes are the body's
+    at = np.searchsorted(log.attitude_us, log.aiding["time"] * 1e6).clip(0, len(log.attitude_us) - 1)
+    level = rotated(log.attitude[at], log.aiding["value"][:, :3]) / strength[:, None]
+    assert np.linalg.norm(level - level.mean(axis=0), axis=1).mean() < 0.1
+
+
+SENSORS = {
+    "sensor_combined": (
+        "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;int32_t magnetometer_timestamp_relative;"
+        "float[3] magnetometer_ga;int32_t baro_timestamp_relative;float baro_alt_meter",
+        "<Q3f3fi3fif",
+    ),
+    "vehicle_attitude": ("uint64_t timestamp;float[4] q", "<Q4f"),
+    "vehicle_gps_position": (
+        "uint64_t timestamp;int32_t lat;int32_t lon;int32_t alt_ellipsoid;float s_variance_m_s;float eph;float epv;"
+        "float vel_n_m_s;float vel_e_m_s;float vel_d_m_s;uint8_t fix_type",
+        "<Qiii6fB",
+    ),
+    "sensor_gps": (
+        "uint64_t timestamp;double latitude_deg;double longitude_deg;double altitude_ellipsoid_m;float s_variance_m_s;"
+        "float eph;float epv;float vel_n_m_s;float vel_e_m_s;float vel_d_m_s;uint8_t fix_type",
+        "<Q3d6fB",
+    ),
+    "vehicle_magnetometer": ("uint64_t timestamp;float[3] magnetometer_ga", "<Q3f"),
+    "vehicle_air_data": ("uint64_t timestamp;float baro_alt_meter", "<Qf"),
+}
+
+
+def made(path, topics, **parameters):
+    """A ULog of `topics`: (name, instance) to rows of values."""
+
+    def message(kind, body):
+        return struct.pack("<HB", len(body), ord(kind)) + body
+
+    data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
+    for name in {name for name, _ in topics}:
+        data += message("F", f"{name}:{SENSORS[name][0]};".encode())
+    for key, value in parameters.items():
+        name = f"float {key}".encode()
+        data += message("P", bytes([len(name)]) + name + struct.pack("<f", value))
+    for number, (name, instance) in enumerate(topics):
+        data += message("A", struct.pack("<BH", instance, number) + name.encode())
+    for number, ((name, _), rows) in enumerate(topics.items()):
+        for row in rows:
+            data += message("D", struct.pack("<H", number) + struct.pack(SENSORS[name][1], *row))
+    path.write_bytes(data)
+    return path
+
+
+def base(n=500, mag=-2000, baro=-5000):
+    """A level board at rest, 250 Hz; its magnetometer and barometer speak with every fifth sample."""
+    imu = []
+    for k in range(n):
+        new = k % 5
+        imu.append(
+            (10**6 + 4000 * k, 0, 0, 0, 0, 0, -9.81, mag - 4000 * new + new % 2, 0.2, 0.0, 0.4, baro - 4000 * new, 77.0)
+        )
+    attitude = [(10**6 + 20_000 * k, 1, 0, 0, 0) for k in range(n // 5)]
+    return {("sensor_combined", 0): imu, ("vehicle_attitude", 0): attitude}
+
+
+def test_old_logs_carry_field_and_height_with_the_samples(tmp_path):
+    log = read_ulog(made(tmp_path / "old.ulg", base(), EKF2_BARO_NOISE=2.0, EKF2_BARO_DELAY=30.0))
+    for kind, value, sigma, age in ((Kind.MAGNETIC, 20e-6, 5e-6, 0.002), (Kind.BARO, 77.0, 2.0, 0.035)):
+        rows = log.aiding[log.aiding["kind"] == kind]
+        assert len(rows) == 100, "once for each that is new"
+        np.testing.assert_allclose(rows["value"][:, 0], value, rtol=1e-6)
+        np.testing.assert_allclose(rows["sigma"][:, 0], sigma, rtol=1e-6)
+        arrivals = log.arrival_us[log.aiding["kind"] == kind] * 1e-6
+        np.testing.assert_allclose(arrivals - rows["time"], age, atol=1e-9)
+
+
+OLD_FIX = (500000000, 360000000, 150000, 0.4, 1.5, 2.5, 1.0, 2.0, -3.0)
+NEW_FIX = (50.0, 36.0, 150.0, 0.4, 1.5, 2.5, 1.0, 2.0, -3.0)
+
+
+@pytest.mark.parametrize(("topic", "fix"), [("vehicle_gps_position", OLD_FIX), ("sensor_gps", NEW_FIX)])
+def test_fixes_of_old_and_new_logs(tmp_path, topic, fix):
+    topics = base(mag=2**31 - 1 - 5, baro=0)
+    topics["sensor_combined", 0] = [
+        (*r[:7], 2**31 - 1, *r[8:11], 2**31 - 1, r[12]) for r in topics["sensor_combined", 0]
+    ]
+    topics[topic, 0] = [(10**6 + 200_000 * k, *fix, 3 if k else 2) for k in range(9)]
+    log = read_ulog(made(tmp_path / "fix.ulg", topics, EKF2_GPS_DELAY=150.0))
+    assert len(log.aiding) == 8, "the first has no height; magnetometer and barometer never spoke"
+    np.testing.assert_allclose(
+        log.aiding["value"], [[math.radians(50), math.radians(36), 150.0, 1.0, 2.0, -3.0]] * 8, rtol=1e-12
+    )
+    np.testing.assert_allclose(log.aiding["sigma"], [[1.5, 1.5, 2.5, 0.4, 0.4, 0.4]] * 8, rtol=1e-6)
+    np.testing.assert_allclose(log.arrival_us * 1e-6 - log.aiding["time"], 0.15, atol=1e-8)
+    assert log.place == pytest.approx((math.radians(50), math.radians(36), 150.0))
+
+
+def test_several_instances_keep_apart(tmp_path):
+    topics = base()
+    topics["vehicle_magnetometer", 1] = [(10**6 + 10_000 * k, 0.3, 0, 0) for k in range(50)]
+    topics["vehicle_air_data", 0] = [(10**6 + 50_000 * k, 80.0) for k in range(10)]
+    log = read_ulog(made(tmp_path / "many.ulg", topics))
+    second = log.aiding[(log.aiding["kind"] == Kind.MAGNETIC) & (log.aiding["source"] == 1)]
+    assert len(second) == 50
+    np.testing.assert_allclose(second["value"][:, 0], 30e-6, rtol=1e-6)
+    assert (np.diff(log.arrival_us) >= 0).all()
+
+
+def test_a_lone_leap_of_the_time_takes_no_other_sample_along():
+    times = 1000 * np.arange(1, 50)
+    times[0], times[20], times[30], times[48] = 10**13, 10**12, 3, 10**12
+    assert np.flatnonzero(~steady(times)).tolist() == [0, 20, 30, 48]
+    gap = np.array([1, 2, 2, 3, 5_000_000, 5_001_000, 5_002_000])
+    assert steady(gap).tolist() == [True] * 2 + [False] + [True] * 4
+    assert len(steady(np.zeros(0, np.int64))) == 0

@@ -1,0 +1,103 @@
+"""Aiding in the loop: a measurement is taken between the samples between which it came, however the frames are batched."""
+
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.can.aiding import is_aiding
+from drivers.can.frames import FrameArray
+from hil.bridge import AIDING_KEPT, Loop, LoopOrder, Outlets
+from hil.scenario import Scenario
+from hil.world.aiding import SimulatedAiding
+from hil.world.head import SimulatedHead
+
+SCENARIO = Scenario.model_validate(
+    {
+        "bus": "unix:none",
+        "head": {"rate_hz": 200},
+        "motion": {"north": {"rate": 5.0}},
+        "navigation": {"alignment": "truth"},
+        "aiding": {"gnss": [{"delay_s": 0.11}], "baro": [{}], "magnetometer": [{"rate_hz": 90}], "heading": [{}]},
+    }
+)
+SAMPLES = 400
+
+
+@cache
+def sent() -> FrameArray:
+    """Two seconds of the simulated head."""
+    return np.concatenate([part for _, *parts in SimulatedHead(SCENARIO).chunks(SAMPLES) for part in parts])
+
+
+class Watched(Loop):
+    """Notes how many samples have been navigated when a measurement comes."""
+
+    def __init__(self) -> None:
+        super().__init__(LoopOrder(SCENARIO, paced=False), Outlets.make(recording=False, readers=1))
+        self.places: list[int] = []
+
+    def _take(self, batch: FrameArray) -> bool:
+        self.places += [self._samples] * (len(self.aided) - len(self.places))
+        return super()._take(batch)
+
+
+def run(cuts: list[int]) -> Watched:
+    loop = Watched()
+    for start, stop in pairwise([0, *sorted(cuts), len(sent())]):
+        if stop > start:
+            loop.take(sent()[start:stop])
+    return loop
+
+
+@cache
+def whole() -> Watched:
+    return run([])
+
+
+@settings(max_examples=8)
+@given(st.lists(st.integers(1, 550), max_size=8))
+def test_batches_do_not_matter(cuts: list[int]) -> None:
+    loop, reference = run(cuts), whole()
+    np.testing.assert_array_equal(np.array(loop.aided), np.array(reference.aided))
+    assert loop.places == reference.places
+    assert loop.result()["navigation_digest"] == reference.result()["navigation_digest"]
+
+
+def test_what_the_world_sent_is_taken_behind_its_sample() -> None:
+    loop = whole()
+    rows, arrivals = SimulatedAiding(SCENARIO).arrived(SAMPLES * 5000)
+    np.testing.assert_allclose([row["time"] for row in loop.aided], rows["time"], atol=1e-9)
+    assert [row["kind"] for row in loop.aided] == rows["kind"].tolist()
+    ends = 5000 * np.arange(1, SAMPLES + 1)
+    assert loop.places == [int(np.searchsorted(ends, arrival)) + 1 for arrival in arrivals]
+
+
+def test_they_are_counted_by_kind_and_disturb_no_counter() -> None:
+    result, stats = whole().result(), whole()._outlets.stats
+    assert result["aiding"] == {"GNSS": 9, "BARO": 20, "MAGNETIC": 180, "HEADING": 10}
+    assert not any(result["aiding_faults"].values())
+    assert stats["foreign"] == stats["short"] == stats["lost"] == 0
+    assert (stats["frames"], stats["samples"]) == (len(sent()), SAMPLES)
+    assert is_aiding(sent()["can_id"]).sum() == len(whole().aided)
+
+
+def test_a_wrong_frame_is_dropped_and_counted() -> None:
+    bad = sent().copy()
+    bad["data"][np.flatnonzero(is_aiding(bad["can_id"]))[5], 12] ^= 1
+    loop = Watched()
+    loop.take(bad)
+    assert len(loop.aided) == len(whole().aided) - 1
+    assert loop.result()["aiding_faults"]["crc_errors"] == 1
+    assert loop.result()["navigation_digest"] == whole().result()["navigation_digest"]
+
+
+def test_only_the_newest_wait() -> None:
+    loop = Watched()
+    many = sent()[is_aiding(sent()["can_id"])]
+    loop.take(sent())
+    for _ in range(AIDING_KEPT // len(many) + 1):
+        loop.take(many)
+    assert len(loop.aided) == AIDING_KEPT
