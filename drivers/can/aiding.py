@@ -89,7 +89,7 @@ class AidingEncoder:
     """Frames of one sender of measurements; remembers the counter of each message."""
 
     def __init__(self) -> None:
-        self._counts = dict.fromkeys(Kind, 0)
+        self._counts = dict.fromkeys(_messages(), 0)
 
     def frames(self, rows: AidingArray) -> FrameArray:
         """A frame for each row of `AIDING`, in their order.
@@ -103,7 +103,9 @@ class AidingEncoder:
         batch = frames(len(rows))
         for kind in np.unique(rows["kind"]).tolist():
             if kind not in self._counts:
-                raise HilError(f"aiding: kind {kind} is not known; known are {', '.join(k.name for k in Kind)}")
+                raise HilError(
+                    f"aiding: kind {kind} has no message; those that have one: {', '.join(k.name for k in _messages())}"
+                )
             chosen = np.flatnonzero(rows["kind"] == kind)
             batch[chosen] = self._encoded(_messages()[Kind(kind)], rows[chosen])
         return batch
@@ -137,7 +139,7 @@ class AidingDecoder:
         self._last: dict[Kind, int] = {}
         self.counters = Counters()
         """As for a board: `samples` are measurements, `restarts` counters that went back, `foreign` unused reserved ids."""
-        self.heard = dict.fromkeys(Kind, 0)
+        self.heard = dict.fromkeys(_messages(), 0)
         """Good measurements of each kind."""
 
     def decode(self, batch: FrameArray, now: float | None) -> tuple[AidingArray, IntArray]:
