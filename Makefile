@@ -2,6 +2,7 @@
 #
 #   make run   [ARGS="--duration 10"]   the bridge with its built-in scenario
 #   make test  [ARGS="-k ring"]         all tests, those on real SocketCAN included
+#   make studies                        the studies of several minutes, whole
 #   make lint                           ruff, mypy, import rules
 #   make dev                            .venv with everything that a developer needs
 #   make vcan                           install what the SocketCAN tests need on a kernel without CAN (Debian, root or sudo)
@@ -11,7 +12,7 @@ SHELL := /bin/bash
 PYTHON ?= python3
 ARGS ?=
 
-.PHONY: run test lint dev vcan clean
+.PHONY: run test studies lint dev vcan clean
 .DELETE_ON_ERROR:
 
 run: .venv/.installed-run
@@ -19,6 +20,9 @@ run: .venv/.installed-run
 
 test: .venv/.installed-test
 	@tools/test.sh $(ARGS)
+
+studies: .venv/.installed-test
+	@.venv/bin/python -m pytest -m study $(ARGS)
 
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .

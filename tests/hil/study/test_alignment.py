@@ -14,7 +14,7 @@ from hil.study.navigation.flights import flight
 from nav.instruments.grades import GRADES
 
 
-@pytest.mark.slow
+@pytest.mark.study
 def test_every_limit_is_kept():
     assert [row for row in run().rows if not row.ok] == []
 
