@@ -13,7 +13,6 @@ import hashlib
 import math
 import signal
 import time
-from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -28,6 +27,7 @@ from drivers.can.frames import FrameArray, frames
 from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
 from hil.control import Control
+from hil.magnetic import magnetic_field
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
@@ -37,16 +37,17 @@ from hil.warmup import warm_loop
 from hil.world.instruments import head_model
 from hil.world.truth import TruthKeeper
 from nav.errors import HilError
+from nav.filter.aided import Settings as FilterSettings
+from nav.filter.states import SENSOR_BLOCKS, Block, tuning
 from nav.gaps import GapPolicy
 from nav.increments import HeadIncrements, ImuIncrements, IntArray
+from nav.instruments.grades import GRADES
 from nav.instruments.head import HeadCombiner
-from nav.navigator import Navigator, Settings
+from nav.navigator import Aiding, Navigator, Settings
 from nav.state import HOST_FIELDS, NAV_STATE
 
 BATCH = 1024
 """Most frames taken at once."""
-AIDING_KEPT = 1024
-"""Most measurements that wait for the navigator; the oldest go first."""
 TICK_S = 0.02
 """Longest wait for a frame."""
 AIDING_FAULTS = ("lost", "duplicated", "crc_errors", "foreign", "short", "version_errors", "restarts")
@@ -120,7 +121,25 @@ def settings_of(scenario: Scenario) -> Settings:
         gravity=navigation.gravity,
         lever_arm=scenario.head.lever_arm_m,
         gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
+        aiding=aiding_of(scenario, math.radians(latitude), math.radians(longitude)) if navigation.aided else None,
     )
+
+
+def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
+    """How the filter of a scenario is set."""
+    head, aiding, height = scenario.head, scenario.aiding, scenario.motion.height_m
+    grade = GRADES["dtg" if head.grade == "none" else head.grade]
+    arm = np.subtract(aiding.gnss[0].lever_arm_m, head.lever_arm_m) if aiding.gnss else np.zeros(3)
+    field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
+    return Aiding(
+        tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=True),
+        FilterSettings(lever_arm=_three(arm), field_n=_three(field_n)),
+        np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, *np.radians([0.01, 0.01, 0.2])]),
+    )
+
+
+def _three(vector: NDArray[np.float64]) -> tuple[float, float, float]:
+    return float(vector[0]), float(vector[1]), float(vector[2])
 
 
 class Loop:
@@ -133,8 +152,6 @@ class Loop:
         self.navigator = Navigator(settings_of(scenario))
         self.finished = False
         """The scenario's duration is over."""
-        self.aided: deque[np.void] = deque(maxlen=AIDING_KEPT)
-        """Measurements that aid the navigator (`AIDING`), in the order in which they came."""
         self._aiding = AidingDecoder()
         self._now: float | None = None
         """Device time of the newest sample."""
@@ -177,7 +194,7 @@ class Loop:
         for stop in (*cuts.tolist(), len(batch)):
             end = int(np.searchsorted(places, stop))
             if end > taken:
-                self.aided.extend(rows[taken:end])
+                self.navigator.aid(rows[taken:end])
             got = self._take(batch[start:stop]) or got
             start, taken = stop, end
         return got

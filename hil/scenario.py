@@ -271,6 +271,8 @@ class NavigationConfig(_Model):
     """After a gap longer than this nothing is bridged: the navigator aligns again."""
     silence_s: Annotated[float, Field(gt=0, le=10)] = 0.08
     """Without a sample for this long the mode is degraded."""
+    aided: bool = False
+    """Use what comes besides the inertial samples: the error-state filter corrects the navigator."""
     track_bias_at_rest: bool = False
     """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
 

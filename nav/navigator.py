@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from nav.alignment import rest
 from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.errors import HilError
+from nav.filter.aided import AidedNavigator
+from nav.filter.aided import Settings as FilterSettings
+from nav.filter.states import GYRO_BIAS, Tuning
 from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, Validity
@@ -36,6 +39,25 @@ REST_GAIN = 0.2
 """Weight of one window in the tracked bias (time constant about 10 s)."""
 REST_BIAS_STEP = 0.003
 """A window that would change the bias by more than this is a slow turn, not rest, rad/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aiding:
+    """How measurements besides the inertial ones are used.
+
+    Attributes
+    ----------
+    tuning : Tuning
+        What the sensors are worth and what is estimated of them.
+    filter : nav.filter.aided.Settings
+        How the filter is run.
+    sigma : (9,) float
+        Of the start, at least: position and velocity north, east, down (m, m/s), attitude about them (rad).
+    """
+
+    tuning: Tuning
+    filter: FilterSettings
+    sigma: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +95,8 @@ class Settings:
     gravity: str = "normal"
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gaps: GapPolicy = field(default_factory=GapPolicy)
+    aiding: Aiding | None = None
+    """None: measurements besides the inertial ones are not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +119,8 @@ class Navigator:
 
     def __init__(self, settings: Settings) -> None:
         self._core = Strapdown(settings.attitude, settings.mechanization, settings.gravity)
+        aiding = settings.aiding
+        self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -133,7 +159,7 @@ class Navigator:
         """
         self._state = _solution(lat, lon, height, vel_n, q_nb)
         self._move(1.0, w_ib_b)
-        self._start_core()
+        self._start_core(time, 0.0, 0.0)
         self._sums[:] = 0.0
         self._progress = 1.0
         self.tell(time, "info", "navigating from a given start")
@@ -150,6 +176,19 @@ class Navigator:
         lat, lon, height = self._state[:3]
         self._state = _solution(lat, lon, height, np.zeros(3), np.zeros(4))
         self.tell(time, "notice", f"aligning: {reason}")
+
+    def aid(self, rows: NDArray[Any]) -> None:
+        """Take measurements (:data:`nav.aiding.AIDING`); those that come before the navigation has begun are not used.
+
+        Raises
+        ------
+        HilError
+            A value or a standard deviation that is used is no number.
+        """
+        if self._aided is not None and self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
+            self._aided.aid(rows)
+            for restart in self._aided.restarts():
+                self.tell(restart.time, "warning", "the filter had diverged: it starts again where GNSS says")
 
     def silent(self) -> StateArray:
         """The sensor has fallen silent: one row that repeats the last state and says so."""
@@ -210,9 +249,15 @@ class Navigator:
         rate = np.zeros((1, 3)) if w_ib_b is None else np.asarray(w_ib_b, float).reshape(1, 3)
         shift(lat, lon, height, vel_n.reshape(1, 3), q_nb.reshape(1, 4), rate, sign * self._arm)
 
-    def _start_core(self) -> None:
+    def _start_core(self, time: float, sigma_tilt: float, sigma_heading: float) -> None:
         lat, lon, height = self._state[:3]
-        self._core.start(lat, lon, height, self._state[3:6], self._state[6:10])
+        if self._aided is None or self.settings.aiding is None:
+            self._core.start(lat, lon, height, self._state[3:6], self._state[6:10])
+            return
+        sigma = self.settings.aiding.sigma.copy()
+        sigma[6:9] = np.maximum(sigma[6:9], [sigma_tilt, sigma_tilt, sigma_heading])
+        self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma)
+        self._aided.estimates[GYRO_BIAS] = self.gyro_bias
 
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):
@@ -272,7 +317,7 @@ class Navigator:
         self._sums[:] = 0.0
         self._state[6:10] = result.q_nb
         self._move(1.0)
-        self._start_core()
+        self._start_core(time, result.sigma_tilt, result.sigma_heading)
         self.mode = Mode.NAVIGATE
         heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(result.q_nb))
         self.tell(
@@ -293,15 +338,20 @@ class Navigator:
         n = stop - start
         position, velocity, attitude = (array[:n] for array in self._scratch)
         before = self._core.mechanization
-        done = self._core.advance(
-            imu.step[start:stop],
-            imu.dtheta[start:stop],
-            imu.dvel[start:stop],
-            self.gyro_bias,
-            position,
-            velocity,
-            attitude,
-        )
+        if self._aided is None:
+            done = self._core.advance(
+                imu.step[start:stop],
+                imu.dtheta[start:stop],
+                imu.dvel[start:stop],
+                self.gyro_bias,
+                position,
+                velocity,
+                attitude,
+            )
+        else:
+            position, velocity, attitude = self._aided.process(imu.rows(start, stop))
+            self.gyro_bias = self._aided.estimates[GYRO_BIAS].copy()
+            done = n if self._core.mechanization == before else 0
         self._state[:] = self._core.solution
         if done < n:
             self.tell(
