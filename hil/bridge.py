@@ -1,7 +1,7 @@
 """The loop: frames in, solutions into the ring. It owns its process, blocks on the bus only, and never formats or logs.
 
     source -> driver -> head compensation -> navigator -> lever arm -> ring (publisher, status line, dashboard)
-         \\-> aiding (decoded, kept)                              \\-> frames ring (recorder)
+         \\-> aiding (to the navigator)                            \\-> frames ring (recorder)
 
 Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched: a measurement is taken
 between the samples between which it came. What the loop does on its own account (silence, an ordered alignment) goes into the

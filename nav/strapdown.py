@@ -5,7 +5,6 @@ and `high-order` the rotation comes from that method and the velocity and positi
 mechanization answers in the same terms: geodetic position, velocity in n, q_nb.
 """
 
-import copy
 import math
 from collections.abc import Callable
 from copy import deepcopy
@@ -112,7 +111,7 @@ class Strapdown:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on with a core of one's own."""
-        self.__dict__.update(copy.deepcopy(state))
+        self.__dict__.update(deepcopy(state))
         self._look()
 
     @property

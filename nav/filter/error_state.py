@@ -22,7 +22,7 @@ from nav.error_dynamics import fill_dynamics, fill_input, fill_transition
 from nav.filter.states import STATES, Tuning, places
 from nav.increments import FloatArray, IntArray
 from nav.kernel import kernel
-from nav.turn import matrix_from_quaternion, quaternion_of
+from nav.turn import matrix_from_quaternion, multiply, quaternion_of
 
 MEASURED = 3
 """Most components of a measurement that is judged at once."""
@@ -63,12 +63,9 @@ def _fill_interval(
     """Nine rows of the transition, `phi` (9, n), and the input `gain` (9, 6); `nine` (3, 9, 9) is room to work in."""
     step = sums[0]
     c, f, transition = nine[2, :3, :3], nine[0], nine[1]
-    w, x, y, z = quaternion_of(-0.5 * sums[1], -0.5 * sums[2], -0.5 * sums[3])
     q, vel, force = nine[2, 3, :4], nine[2, 4, :3], nine[2, 5, :3]
-    q[0] = after[6] * w - after[7] * x - after[8] * y - after[9] * z
-    q[1] = after[6] * x + after[7] * w + after[8] * z - after[9] * y
-    q[2] = after[6] * y - after[7] * z + after[8] * w + after[9] * x
-    q[3] = after[6] * z + after[7] * y - after[8] * x + after[9] * w
+    q[0], q[1], q[2], q[3] = quaternion_of(-0.5 * sums[1], -0.5 * sums[2], -0.5 * sums[3])
+    multiply(after[6:10], q, q)
     matrix_from_quaternion(q, c)
     for i in range(3):
         vel[i] = 0.5 * (before[3 + i] + after[3 + i])
