@@ -13,7 +13,7 @@ import hashlib
 import math
 import signal
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
 from hil.world.instruments import head_model
 from hil.world.truth import TruthKeeper
+from nav.aiding import Kind
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.states import SENSOR_BLOCKS, Block, tuning
@@ -52,6 +53,8 @@ TICK_S = 0.02
 """Longest wait for a frame."""
 AIDING_FAULTS = ("lost", "duplicated", "crc_errors", "foreign", "short", "version_errors", "restarts")
 """Counters of aiding frames that the summary shows."""
+BAROMETER_M = 1000.0
+"""How far a pressure height may be from the ellipsoid at first, one sigma: it is that above some field, on some day."""
 EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
 """A message for the user, as it lies in the ring of events."""
 
@@ -128,13 +131,28 @@ def settings_of(scenario: Scenario) -> Settings:
 def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     """How the filter of a scenario is set."""
     head, aiding, height = scenario.head, scenario.aiding, scenario.motion.height_m
-    grade = GRADES["dtg" if head.grade == "none" else head.grade]
+    chosen, start = scenario.navigation.filter, scenario.navigation.start
+    grade = GRADES[chosen.grade or ("dtg" if head.grade == "none" else head.grade)]
+    if chosen.gyro_deg_sqrt_h is not None:
+        grade = replace(grade, gyro_white=math.radians(chosen.gyro_deg_sqrt_h) / 60.0)
+    if chosen.accelerometer_ms_sqrt_h is not None:
+        grade = replace(grade, accelerometer_white=chosen.accelerometer_ms_sqrt_h / 60.0)
+    tilt = max(math.radians(0.01), grade.accelerometer_bias / 9.80665)
     arm = np.subtract(aiding.gnss[0].lever_arm_m, head.lever_arm_m) if aiding.gnss else np.zeros(3)
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
+    if chosen.declination_deg is not None:
+        there, level = math.radians(chosen.declination_deg), math.hypot(field_n[0], field_n[1])
+        field_n[:2] = level * math.cos(there), level * math.sin(there)
     return Aiding(
-        tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=True),
-        FilterSettings(lever_arm=_three(arm), field_n=_three(field_n)),
-        np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, *np.radians([0.01, 0.01, 0.2])]),
+        tuning(
+            grade,
+            (*SENSOR_BLOCKS, Block.BAROMETER_BIAS),
+            bias_removed=True,
+            barometer=BAROMETER_M,
+            barometer_walk=chosen.barometer_m_sqrt_s,
+        ),
+        FilterSettings(lever_arm=_three(arm), field_n=_three(field_n), magnetic_heading=chosen.magnetic == "heading"),
+        np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, tilt, tilt, math.radians(start.heading_sigma_deg)]),
     )
 
 
@@ -155,6 +173,9 @@ class Loop:
         self._aiding = AidingDecoder()
         self._now: float | None = None
         """Device time of the newest sample."""
+        self._first: float | None = None
+        """Device time at which the first sample began."""
+        self._withheld = 0
         self._combiner = HeadCombiner(head_model(scenario.head))
         self._calibrated = None if scenario.head.calibration is None else int(scenario.head.calibration["serial"])
         self._outlets = outlets
@@ -194,10 +215,21 @@ class Loop:
         for stop in (*cuts.tolist(), len(batch)):
             end = int(np.searchsorted(places, stop))
             if end > taken:
-                self.navigator.aid(rows[taken:end])
+                self.navigator.aid(self._given(rows[taken:end]))
             got = self._take(batch[start:stop]) or got
             start, taken = stop, end
         return got
+
+    def _given(self, rows: NDArray[Any]) -> NDArray[Any]:
+        """The measurements that are not withheld."""
+        if self._first is None:
+            return rows
+        for outage in self.scenario.navigation.filter.withheld:
+            since = rows["time"] - self._first
+            there = (since >= outage.start_s) & (since < outage.end_s) & (rows["kind"] == Kind[outage.kind.upper()])
+            self._withheld += int(there.sum())
+            rows = rows[~there]
+        return rows
 
     def _take(self, batch: FrameArray) -> bool:
         driver = self.driver
@@ -206,6 +238,8 @@ class Loop:
             self._count()
             return False
         self._now = float(raw.time[-1])
+        if self._first is None:
+            self._first = float(raw.time[0] - raw.step[0])
         arrivals, start = driver.arrivals(), 0
         if driver.counters.restarts != self._restarts:  # its clock begins anew, maybe in the middle of the batch
             self._restarts = driver.counters.restarts
@@ -344,6 +378,8 @@ class Loop:
             "failed_axes": self._combiner.failed(),
             "aiding": {kind.name: count for kind, count in self._aiding.heard.items() if count},
         }
+        if self._withheld:
+            result["withheld"] = self._withheld
         if self._aiding.counters.frames:
             faults = self._aiding.counters.as_dict()
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}

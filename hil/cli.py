@@ -114,6 +114,10 @@ def replay(
     speed: Speed = "1",
     record: Record = None,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
+    withhold: Annotated[
+        list[str] | None,
+        typer.Option(help="KIND:START:END: keep this aiding from the navigator, gnss:120:140 (seconds)."),
+    ] = None,
     assertion: Asserts = None,
     junit: Junit = None,
     as_json: Json = False,
@@ -124,7 +128,7 @@ def replay(
     from hil.player import plan_replay, run_player
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
-    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink)))
+    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold)))
     if plot is not None:
         if order.reference is None:
             raise HilError(f"--plot: {log} carries no attitude to compare with")
@@ -418,11 +422,20 @@ def _paced(speed: str) -> bool:
     return speed == "1"
 
 
-def _changes(mavlink: list[str] | None = None, **options: Any) -> dict[str, Any]:
+def _changes(mavlink: list[str] | None = None, withhold: list[str] | None = None, **options: Any) -> dict[str, Any]:
     changes = {key: value for key, value in options.items() if value is not None}
+    if withhold:
+        changes["navigation"] = {"filter": {"withheld": [_outage(text) for text in withhold]}}
     if mavlink:
         changes["mavlink"] = {"links": () if mavlink == ["none"] else tuple(mavlink)}
     return changes
+
+
+def _outage(text: str) -> dict[str, Any]:
+    parts = text.split(":")
+    if len(parts) != 3:
+        raise HilError(f"--withhold {text}: give KIND:START:END, as gnss:120:140")
+    return dict(zip(("kind", "start_s", "end_s"), parts, strict=True))
 
 
 def _say(text: str) -> None:

@@ -1,6 +1,7 @@
 """Distances and angles between a solution and a reference, in the units that a user reads."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,9 @@ from nav.increments import FloatArray
 from nav.rotation import attitude_error, euler_from_quaternion
 
 
-def position_error(lat: FloatArray, lon: FloatArray, height: FloatArray, reference: NDArray[np.void]) -> FloatArray:
+def position_error(
+    lat: FloatArray, lon: FloatArray, height: FloatArray, reference: Mapping[str, FloatArray] | NDArray[np.void]
+) -> FloatArray:
     """(n, 3) north, east, down offset from `reference` (fields lat, lon, height), m."""
     error = np.empty((len(lat), 3))
     for k in range(len(lat)):

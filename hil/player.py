@@ -26,11 +26,17 @@ from hil.reference import Reference, interpolate_attitude
 from hil.scenario import Scenario, load, validated
 from hil.source import FileSource, is_own
 from hil.stats import Stats
+from nav.aiding import Kind
+from nav.alignment.analytic import magnetic_heading
 from nav.errors import HilError
 from nav.rotation import euler_from_quaternion
 
 ALIGN_S = 1.5
 """Averaging time at the start of a log of a board that cannot gyrocompass."""
+MAGNETIC_SIGMA_DEG = 8.0
+"""Of a heading by an undisturbed magnetometer of a small vehicle."""
+SHAKEN_S = 5.0
+"""How long the error lasts that vibration makes in an accelerometer (rectified, folded): noise of that correlation time."""
 SLOW_S = 1.0
 CHUNK = 256
 _IMU_LOGS: dict[str, Callable[[Path], ImuLog]] = {
@@ -61,6 +67,7 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
             gyro_time=np.asarray(log.time_us * 1e-6, float),
             gyro=log.rate,
             start=float(log.time_us[0]) * 1e-6,
+            fixes=log.track,
         )
         scenario = scenario.with_changes(bus=bus or f"unix:replay-{time.monotonic_ns():x}")
         return LoopOrder(scenario, paced=paced, reference=reference), True
@@ -87,17 +94,21 @@ def _recorded_scenario(path: Path, header: dict[str, Any]) -> Scenario:
 
 
 def _board_scenario(path: Path, log: ImuLog) -> Scenario:
-    """For a board that cannot gyrocompass: level at the start, bias kept at rest.
+    """For a board that cannot gyrocompass: level at the start, heading by its magnetometer, then aided by what the log has.
 
-    The heading is the log's own estimate, the place that of the first fix.
+    The place is that of the first fix. Without a magnetometer the heading is that of the log's own estimate, and without any
+    aiding the gyro bias is kept at rest.
     """
-    times = np.asarray(log.attitude_us * 1e-6, float)
-    at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
-    heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])
-    start = {"heading_deg": math.degrees(heading)}
+    heading = _magnetic_start(log)
+    if heading is None:
+        times = np.asarray(log.attitude_us * 1e-6, float)
+        at = np.clip(float(log.time_us[0]) * 1e-6 + ALIGN_S, times[0], times[-1])
+        heading, _, _ = euler_from_quaternion(interpolate_attitude(times, log.attitude, np.array([at]))[0])
+    start = {"heading_deg": math.degrees(heading), "heading_sigma_deg": MAGNETIC_SIGMA_DEG}
     if log.place is not None:
         lat, lon, height = log.place
         start |= {"latitude_deg": math.degrees(lat), "longitude_deg": math.degrees(lon), "height_m": height}
+    period_s = log.period_us * 1e-6
     return Scenario.model_validate(
         {
             "name": path.stem,
@@ -106,10 +117,29 @@ def _board_scenario(path: Path, log: ImuLog) -> Scenario:
                 "alignment": "level",
                 "align_s": ALIGN_S,
                 "start": start,
-                "track_bias_at_rest": True,
+                "track_bias_at_rest": len(log.aiding) == 0,
+                "aided": len(log.aiding) > 0,
+                "filter": {
+                    "grade": "mems",
+                    "gyro_deg_sqrt_h": max(math.degrees(log.shake(log.rate) * math.sqrt(period_s)) * 60.0, 0.3),
+                    "accelerometer_ms_sqrt_h": max(log.shake(log.force) * math.sqrt(2.0 * SHAKEN_S) * 60.0, 0.1),
+                    "magnetic": "heading",
+                    "declination_deg": None if log.declination is None else math.degrees(log.declination),
+                },
             },
         }
     )
+
+
+def _magnetic_start(log: ImuLog) -> float | None:
+    """Heading at the start of a log, rad, level by the forces and north by the magnetometer; None without one."""
+    end_us = log.time_us[0] + ALIGN_S * 1e6
+    there = (log.aiding["kind"] == Kind.MAGNETIC) & (log.arrival_us <= end_us)
+    there &= log.aiding["source"] == log.aiding["source"][there].min(initial=np.iinfo(np.int32).max)
+    if not there.any():
+        return None
+    flux = log.aiding["value"][there, :3].mean(axis=0)
+    return magnetic_heading(log.force[log.time_us <= end_us].mean(axis=0), flux, log.declination or 0.0)
 
 
 def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _: Stats, answer: Connection) -> None:

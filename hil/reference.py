@@ -1,4 +1,4 @@
-"""Comparison with an attitude that came with a log: the autopilot's own estimate."""
+"""Comparison with what came with a log: the autopilot's own estimate of the attitude, and the track of its receiver."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.geometry import Spread, attitude_difference
+from hil.geometry import Spread, attitude_difference, position_error
+from nav.aiding import AIDING
 from nav.increments import FloatArray
 from nav.state import Mode
 from nav.turn import multiply, normalise, quaternion_of
@@ -17,16 +18,18 @@ SETTLE_S = 10.0
 
 @dataclass(slots=True)
 class Trace:
-    """Every attitude of a run, kept for the comparison at its end."""
+    """Every attitude and position of a run, kept for the comparison at its end."""
 
     times: list[FloatArray] = field(default_factory=list)
     attitudes: list[FloatArray] = field(default_factory=list)
+    places: list[FloatArray] = field(default_factory=list)
 
     def add(self, rows: NDArray[Any]) -> None:
         """Take solutions (`NAV_STATE`) that have an attitude."""
         good = rows[rows["mode"] >= Mode.NAVIGATE]
         self.times.append(good["time"].copy())
         self.attitudes.append(good["q_nb"].copy())
+        self.places.append(np.stack([good["lat"], good["lon"], good["height"]], axis=1))
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """(n,) times and (n, 4) attitudes."""
@@ -47,6 +50,8 @@ class Reference:
         The raw rates of the log, rad/s, for the baseline of plain integration.
     start : float
         Device time of the log's start, s.
+    fixes : (k,) array of AIDING
+        Of one receiver, in the order of their times.
     """
 
     time: FloatArray
@@ -54,14 +59,18 @@ class Reference:
     gyro_time: FloatArray
     gyro: FloatArray
     start: float
+    fixes: NDArray[Any] = field(default_factory=lambda: np.zeros(0, AIDING))
 
     def differences(self, trace: Trace) -> dict[str, Any]:
-        """``difference`` of our attitude and ``baseline`` of plain gyro integration, from `SETTLE_S` on, degrees."""
+        """``difference`` of our attitude and ``baseline`` of plain gyro integration, from `SETTLE_S` on, degrees.
+
+        With fixes, ``difference`` has that of our position from all of them too, also from those that were withheld.
+        """
         times, attitudes = trace.arrays() if trace.times else (np.zeros(0), np.zeros((0, 4)))
-        return {
-            "difference": self._compare(times, attitudes),
-            "baseline": self._compare(*self._plain()),
-        }
+        difference = self._compare(times, attitudes)
+        if difference is not None:
+            difference |= self._compare_track(times, np.concatenate(trace.places))
+        return {"difference": difference, "baseline": self._compare(*self._plain())}
 
     def chosen(self, times: FloatArray) -> NDArray[np.bool_]:
         """The reference samples that are compared with a solution at `times`."""
@@ -85,6 +94,21 @@ class Reference:
             spread = Spread()
             spread.add(values)
             result[name] = spread.as_dict(180.0 / np.pi)
+        return result
+
+    def _compare_track(self, times: FloatArray, places: FloatArray) -> dict[str, Any]:
+        at = self.fixes["time"]
+        fixes = self.fixes[(at >= max(self.start + SETTLE_S, times[0])) & (at <= times[-1])]
+        if not len(fixes):
+            return {}
+        ours = (np.interp(fixes["time"], times, places[:, i]) for i in range(3))
+        track = dict(zip(("lat", "lon", "height"), fixes["value"][:, :3].T, strict=True))
+        error = position_error(*ours, track)
+        result = {}
+        for name, values in (("horizontal_m", np.hypot(error[:, 0], error[:, 1])), ("vertical_m", error[:, 2])):
+            spread = Spread()
+            spread.add(np.ascontiguousarray(values))
+            result[name] = spread.as_dict()
         return result
 
     def _plain(self) -> tuple[FloatArray, FloatArray]:

@@ -252,6 +252,32 @@ class StartConfig(_Model):
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
     height_m: Finite | None = None
     heading_deg: Finite | None = None
+    heading_sigma_deg: Positive = 0.2
+    """How sure the heading is at the start, at best: of a given one, or of an alignment that supposes more."""
+
+
+class WithheldConfig(Outage):
+    """Aiding that the navigator is not given, from the start of the samples on: to see what it does without."""
+
+    kind: Literal["gnss", "baro", "magnetic", "heading", "attitude", "body_velocity"]
+
+
+class FilterConfig(_Model):
+    """What the error-state filter believes, where ``aided``."""
+
+    grade: Literal["dtg", "tactical", "mems"] | None = None
+    """Of the inertial sensors; left out: that of the head, and dtg for one without a grade."""
+    gyro_deg_sqrt_h: Positive | None = None
+    """Angle random walk; left out: that of the grade. More for a vehicle that shakes: what lies above the sample rate folds."""
+    accelerometer_ms_sqrt_h: Positive | None = None
+    """Velocity random walk; left out: that of the grade."""
+    magnetic: Literal["field", "heading"] = "field"
+    """What is taken of a magnetometer: all of the flux, or where its level part points, whatever its scale."""
+    declination_deg: Finite | None = None
+    """East of true north; left out: that of ``aiding.field`` where the run starts."""
+    barometer_m_sqrt_s: NotNegative = 0.15
+    """Random walk of the pressure height against that of GNSS: the weather, and the slow errors of the fixes."""
+    withheld: tuple[WithheldConfig, ...] = ()
 
 
 class NavigationConfig(_Model):
@@ -273,6 +299,7 @@ class NavigationConfig(_Model):
     """Without a sample for this long the mode is degraded."""
     aided: bool = False
     """Use what comes besides the inertial samples: the error-state filter corrects the navigator."""
+    filter: FilterConfig = FilterConfig()
     track_bias_at_rest: bool = False
     """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
 

@@ -113,6 +113,7 @@ def _log(messages: Mapping[str, _Columns], parameters: Mapping[str, float], undu
         true_us(attitude["us"]),
         quaternion_from_euler(*np.radians([attitude["Yaw"], attitude["Pitch"], attitude["Roll"]])),
         [(rows, true_us(arrivals)) for rows, arrivals in measured],
+        parameters.get("COMPASS_DEC"),
     )
 
 

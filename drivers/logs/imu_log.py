@@ -1,5 +1,6 @@
 """What a flight log gives: samples of its inertial unit, what aids it, and the autopilot's own attitude."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,9 @@ from nav.increments import FloatArray, IntArray
 
 LARGEST_TURN, LARGEST_PUSH = 0.25, 16.0
 """Increments beyond these (rad, m/s) over a nominal period are no motion but damage of the log."""
+
+IRON_S = 1.0
+"""How long the error of a magnetometer lasts, s: as noise of that correlation time it is taken."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,8 @@ class ImuLog:
         Measurements in the order in which they arrived.
     arrival_us : (k,) int
         When they arrived, device time.
+    declination : float, optional
+        Magnetic, east, rad, as the autopilot took it.
     """
 
     time_us: IntArray
@@ -49,6 +55,7 @@ class ImuLog:
     attitude: FloatArray
     aiding: AidingArray
     arrival_us: IntArray
+    declination: float | None = None
 
     @property
     def step_us(self) -> IntArray:
@@ -62,11 +69,27 @@ class ImuLog:
         jumps: NDArray[np.bool_] = np.diff(self.counter, prepend=self.counter[0] - 1) != 1
         return jumps
 
+    def shake(self, values: FloatArray) -> float:
+        """Standard deviation of what shakes in `rate` or `force` (n, 3): what second differences leave of it.
+
+        They reach over four samples, so that means of neighbours do not hide it.
+        """
+        second = values[4:] - 2.0 * values[2:-2] + values[:-4]
+        whole = self.counter[4:] - self.counter[:-4] == 4
+        return math.sqrt(float(np.mean(second[whole] ** 2)) / 6.0) if whole.any() else 0.0  # 1 + 4 + 1 of white noise
+
+    @property
+    def track(self) -> AidingArray:
+        """The fixes of the first receiver, in the order of their times."""
+        fixes = self.aiding[self.aiding["kind"] == Kind.GNSS]
+        fixes = fixes[fixes["source"] == fixes["source"].min(initial=np.iinfo(np.int32).max)]
+        return fixes[np.argsort(fixes["time"], kind="stable")]
+
     @property
     def place(self) -> tuple[float, float, float] | None:
         """Latitude and longitude, rad, and height, m, of the first fix; None without one."""
-        fixes = self.aiding[self.aiding["kind"] == Kind.GNSS]
-        return None if len(fixes) == 0 else tuple(fixes["value"][0, :3].tolist())
+        track = self.track
+        return None if len(track) == 0 else tuple(track["value"][0, :3].tolist())
 
 
 def make_log(
@@ -76,12 +99,13 @@ def make_log(
     attitude_us: IntArray,
     attitude: FloatArray,
     measured: list[tuple[AidingArray, IntArray]],
+    declination: float | None = None,
 ) -> ImuLog:
     """A log from what was read; samples and measurements that cannot be are left out.
 
     Parameters
     ----------
-    time_us, rate, force, attitude_us, attitude
+    time_us, rate, force, attitude_us, attitude, declination
         As in `ImuLog`.
     measured : list of (rows of AIDING, arrivals in us)
         In any order.
@@ -110,6 +134,8 @@ def make_log(
     usable = np.isfinite(rows["value"]).all(1) & (rows["sigma"] > 0.0).all(1)
     usable &= (arrival_us >= time_us[0]) & (arrival_us <= time_us[-1])
     order = np.flatnonzero(usable)[np.argsort(arrival_us[usable], kind="stable")]
+    rows, arrival_us = rows[order], arrival_us[order]
+    _widen(rows)
     return ImuLog(
         time_us=time_us,
         counter=np.concatenate(([0], np.cumsum(missing))),
@@ -118,9 +144,19 @@ def make_log(
         force=force,
         attitude_us=attitude_us[right],
         attitude=attitude[right] / norm[right, None],
-        aiding=rows[order],
-        arrival_us=arrival_us[order],
+        aiding=rows,
+        arrival_us=arrival_us,
+        declination=declination,
     )
+
+
+def _widen(rows: AidingArray) -> None:
+    """Widen the deviations of magnetometers: what they err by, iron and currents, lasts `IRON_S` and is no white noise."""
+    for source in np.unique(rows["source"]):
+        of = (rows["kind"] == Kind.MAGNETIC) & (rows["source"] == source)
+        if of.sum() > 1:
+            period = float(np.median(np.diff(np.sort(rows["time"][of]))))
+            rows["sigma"][of] *= math.sqrt(max(1.0, 2.0 * IRON_S / max(period, 1e-3)))
 
 
 def steady(time_us: IntArray) -> NDArray[np.bool_]:

@@ -5,6 +5,7 @@ magnetometer and barometer, each at the time at which it was true: its time stam
 takes for it. Standard deviations are those that the receiver states; the others are those of the autopilot's filter.
 """
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,7 @@ _DEFAULTS = {
     "EKF2_MAG_NOISE": 0.05,  # Gs
     "EKF2_BARO_NOISE": 3.5,  # m
     "EKF2_GPS_V_NOISE": 0.3,  # m/s
+    "EKF2_MAG_DECL": 0.0,  # deg
 }
 """What PX4 takes where the log does not say."""
 _TOPICS = (
@@ -72,6 +74,7 @@ def read_ulog(path: Path) -> ImuLog:
             _times(attitude),
             _columns(attitude, "q", 4),
             list(_measured(topics, said)),
+            math.radians(said["EKF2_MAG_DECL"]),
         )
     except HilError as error:
         raise HilError(f"log {path}: {error}") from error

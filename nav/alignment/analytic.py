@@ -193,6 +193,25 @@ def level(
     return Alignment(q_nb, mean.w - earth_rate_in_body(q_nb, lat), covariance)
 
 
+def magnetic_heading(f_b: FloatArray, flux_b: FloatArray, declination: float) -> float:
+    """Heading, rad, of a body at rest: the vertical by the force (3,), north by the level part of a magnetic flux (3,).
+
+    `declination`, rad, is that of the flux, east of true north.
+
+    Raises
+    ------
+    AlignmentRefused
+        The flux has no level part.
+    """
+    pitch, roll = _tilt(f_b)
+    north, east, down = dcm_from_euler(0.0, pitch, roll) @ flux_b
+    if not math.hypot(north, east) > 0.1 * abs(down):
+        raise AlignmentRefused(
+            "the magnetic flux stands on the level: it tells no heading; give one, start.heading_deg"
+        )
+    return declination - math.atan2(east, north)
+
+
 def _tilt(f_b: FloatArray) -> tuple[float, float]:
     """Pitch = asin(f_x / g), with all digits near +-90 deg, and roll."""
     x, y, z = f_b

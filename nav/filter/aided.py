@@ -71,6 +71,8 @@ class Settings:
         How much older GNSS is than it says, s, as far as known: it is taken at that time. The estimated delay is what is left.
     field_n : (3,) float, optional
         Magnetic flux in n, T; without it no magnetic row is taken.
+    magnetic_heading : bool
+        Take of a magnetic row nothing but where its level part points: on a scale of its own, or where the field is disturbed.
     """
 
     predict_s: float = 0.02
@@ -80,6 +82,7 @@ class Settings:
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     delay: float = 0.0
     field_n: tuple[float, float, float] | None = None
+    magnetic_heading: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what cannot be."""
@@ -157,6 +160,7 @@ class AidedNavigator:
         self._core, self._filter = core, ErrorState(tuning)
         self._gate = [gates.quantile(self.settings.gate, m + 1) for m in range(MEASURED)]
         self._field = np.zeros(3) if self.settings.field_n is None else np.array(self.settings.field_n, float)
+        self._declination = math.atan2(self._field[1], self._field[0])
         self.estimates = np.zeros(STATES)
         self._sums, self._before, self._instant = np.zeros(7), np.zeros(10), np.zeros(models.INSTANT)
         self._last, self._one = np.zeros(6), np.zeros(6)
@@ -399,7 +403,10 @@ class AidedNavigator:
             offset = float(self.estimates[BAROMETER_BIAS][0])
             self._judge(Channel.BARO, row.source, models.barometer(at, offset, value, sigma, age, *to))
         elif row.kind == Kind.MAGNETIC:
-            m = models.magnetic(at, self._field, value, sigma, age, *to)
+            if self.settings.magnetic_heading:
+                m = models.magnetic_heading(at, self._declination, value, sigma, age, *to)
+            else:
+                m = models.magnetic(at, self._field, value, sigma, age, *to)
             self._judge(Channel.MAGNETIC, row.source, m)
         elif row.kind == Kind.HEADING:
             self._judge(Channel.HEADING, row.source, models.heading(at, value, sigma, age, *to))

@@ -29,6 +29,8 @@ MANOEUVRE = 0.5
 """Share of the difference of the measured force from 1 g that is taken for an acceleration, one sigma, by `gravity`."""
 STEEP = 1e-4
 """Smallest cos^2 of the pitch for which there is a heading."""
+STEEPEST_FLUX = 0.01
+"""Smallest cos^2 of the dip for which a magnetic flux tells a heading."""
 
 
 @inline_kernel
@@ -326,6 +328,35 @@ def magnetic(
         h[m, 6], h[m, 7], h[m, 8] = cross(cx, cy, cz, x, y, z)
         m += 1
     return m
+
+
+@kernel
+def magnetic_heading(
+    instant: FloatArray,
+    declination: float,
+    value: FloatArray,
+    sigma: FloatArray,
+    age: float,
+    h: FloatArray,
+    residual: FloatArray,
+    variance: FloatArray,
+) -> int:
+    """Where the level part of the magnetic flux (3,) in b points: `declination`, rad; of the length nothing is asked.
+
+    None where the flux is nearly vertical. `sigma` is that of the flux, in its unit; the first one counts.
+    """
+    c = _matrix(instant)
+    _fill_matrix(instant, age, c)
+    north, east, down = _turned(c, value[0], value[1], value[2])
+    level = north * north + east * east
+    if level < STEEPEST_FLUX * (level + down * down) or level == 0.0 or not sigma[0] < math.inf:
+        return 0
+    apart = math.atan2(east, north) - declination
+    residual[0] = apart - 2.0 * math.pi * math.floor(apart / (2.0 * math.pi) + 0.5)
+    variance[0] = sigma[0] * sigma[0] / level
+    h[0] = 0.0
+    h[0, 6], h[0, 7], h[0, 8] = -north * down / level, -east * down / level, 1.0
+    return 1
 
 
 @kernel
