@@ -101,9 +101,9 @@ class Reference:
         fixes = self.fixes[(at >= max(self.start + SETTLE_S, times[0])) & (at <= times[-1])]
         if not len(fixes):
             return {}
-        ours = (np.interp(fixes["time"], times, places[:, i]) for i in range(3))
+        lat, lon, height = (np.interp(fixes["time"], times, places[:, i]) for i in range(3))
         track = dict(zip(("lat", "lon", "height"), fixes["value"][:, :3].T, strict=True))
-        error = position_error(*ours, track)
+        error = position_error(lat, lon, height, track)
         result = {}
         for name, values in (("horizontal_m", np.hypot(error[:, 0], error[:, 1])), ("vertical_m", error[:, 2])):
             spread = Spread()

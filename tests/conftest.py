@@ -7,6 +7,9 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+_TESTS = Path(__file__).parent
+_ALONE = {_TESTS / "e2e", _TESTS / "hil", _TESTS / "drivers" / "can", _TESTS / "drivers" / "mavlink"}
+
 hypothesis.settings.register_profile("local", deadline=None)
 hypothesis.settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
 hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "local")
@@ -25,7 +28,10 @@ def _socketcan_lack() -> str | None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip the tests marked `socketcan` where they cannot run."""
+    """Skip the tests marked `socketcan` where they cannot run; mark those that run processes in real time."""
+    for item in items:
+        if item.path.parent in _ALONE:
+            item.add_marker(pytest.mark.alone)
     marked = [item for item in items if item.get_closest_marker("socketcan")]
     if marked and (lack := _socketcan_lack()):
         for item in marked:

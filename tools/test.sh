@@ -2,7 +2,8 @@
 # The tests behind `make test`: test.sh [PYTEST_ARGUMENT...]
 #
 # Everything runs on this kernel. Where it has no vcan0 and none can be made, the tests marked `socketcan` are skipped
-# there and run once more on a user-mode Linux kernel that has one (with_vcan.sh).
+# there and run once more on a user-mode Linux kernel that has one (with_vcan.sh). Without arguments, tests that do not
+# need the machine for themselves run first, side by side on all processors.
 set -u
 cd "$(dirname "$0")/.." || exit 1
 
@@ -18,12 +19,24 @@ make_vcan0() {
 have_guest() { command -v linux.uml && command -v busybox; } &>/dev/null
 can_install() { [ "$(id -u)" = 0 ] && command -v apt-get; } &>/dev/null
 
-if have_vcan0 || make_vcan0; then
-  exec "${pytest[@]}" "$@"
-fi
+run_here() {
+  if [ $# -gt 0 ]; then
+    "${pytest[@]}" "$@"
+    return
+  fi
+  "${pytest[@]}" -n auto -m "not alone and not study"
+  local side_by_side=$?
+  "${pytest[@]}" -m "alone and not study"
+  local alone=$?
+  [ $side_by_side = 0 ] && return $alone
+  return $side_by_side
+}
 
-"${pytest[@]}" "$@"
+have_vcan0 || make_vcan0
+with_vcan0=$?
+run_here "$@"
 here=$?
+[ $with_vcan0 = 0 ] && exit $here
 case $here in 0 | 1 | "$no_tests") ;; *) exit $here ;; esac # interrupted, or pytest itself is unhappy
 
 if ! have_guest && can_install; then

@@ -83,7 +83,8 @@ class ImuLog:
         """The fixes of the first receiver, in the order of their times."""
         fixes = self.aiding[self.aiding["kind"] == Kind.GNSS]
         fixes = fixes[fixes["source"] == fixes["source"].min(initial=np.iinfo(np.int32).max)]
-        return fixes[np.argsort(fixes["time"], kind="stable")]
+        track: AidingArray = fixes[np.argsort(fixes["time"], kind="stable")]
+        return track
 
     @property
     def place(self) -> tuple[float, float, float] | None:

@@ -13,6 +13,7 @@ from hil.bridge import Loop, LoopOrder, Outlets
 from hil.scenario import Scenario
 from hil.world.aiding import SimulatedAiding
 from hil.world.head import SimulatedHead
+from nav.aiding import Kind
 
 SCENARIO = Scenario.model_validate(
     {
@@ -118,3 +119,18 @@ def test_the_loop_navigates_by_them() -> None:
         errors[aided] = loop.result()["error"]
     assert errors[True]["position_m"]["final"] < 3.0 < 0.2 * errors[False]["position_m"]["final"]
     assert errors[True]["velocity_ms"]["final"] < 0.1 < errors[False]["velocity_ms"]["final"]
+
+
+def test_what_is_withheld_is_counted_and_not_given() -> None:
+    withheld = [{"kind": "gnss", "start_s": 0.5, "end_s": 1.5}, {"kind": "baro", "start_s": 0.0, "end_s": 9.0}]
+    scenario = SCENARIO.with_changes(navigation={"filter": {"withheld": withheld}})
+    loop = Loop(LoopOrder(scenario, paced=False), Outlets.make(recording=False, readers=1))
+    given: list[np.void] = []
+    loop.navigator.aid = given.extend  # type: ignore[method-assign]
+    loop.take(sent())
+    whole = run([]).aided
+    kept = [
+        row for row in whole if row["kind"] != Kind.BARO and not (row["kind"] == Kind.GNSS and 0.5 <= row["time"] < 1.5)
+    ]
+    assert [row.tobytes() for row in given] == [row.tobytes() for row in kept]
+    assert loop.result()["withheld"] == len(whole) - len(kept) > 20

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from nav.alignment import rest
-from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
+from nav.alignment.analytic import AlignmentRefused, gyrocompass, level, magnetic_heading
 from nav.alignment.rest import UNSTATED, Sensors
 from nav.earth import normal_gravity
 from nav.frames import earth_rate_in_body
@@ -259,3 +259,17 @@ def test_a_bias_within_tolerance_is_not_refused_but_bounded(lat, heading):
     found = error(gyrocompass(averaged(f, w + bias), lat), attitude)
     assume(math.cos(lat) > 0.2)
     assert abs(found[2]) == pytest.approx(math.atan(0.5 * DEG_H / (EARTH_RATE * math.cos(lat))), rel=1e-6)
+
+
+@given(headings, st.floats(-60, 60), rolls, st.floats(-0.5, 0.5))
+def test_heading_by_the_magnetic_flux(heading, pitch, roll, declination):
+    attitude = Rotation.from_euler("ZYX", [heading, pitch, roll], degrees=True)
+    force = attitude.inv().apply([0.0, 0.0, -9.8])
+    flux = attitude.inv().apply([20.0 * math.cos(declination), 20.0 * math.sin(declination), 45.0])
+    found = magnetic_heading(force, flux, declination)
+    assert math.remainder(found - math.radians(heading), 2.0 * math.pi) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_flux_that_stands_on_the_level_tells_no_heading():
+    with pytest.raises(AlignmentRefused, match="heading_deg"):
+        magnetic_heading(np.array([0.0, 0.0, -9.8]), np.array([0.1, 0.0, 45.0]), 0.0)

@@ -75,6 +75,8 @@ def run(kind, at, then, age, x=None, sigma=None):
         m = models.attitude(at, then["q_nb"].copy(), *to)
     elif kind == Kind.BODY_VELOCITY:
         m = models.body_velocity(at, c.inv().apply(then["vel_n"]), *to)
+    elif kind == "magnetic heading":
+        m = models.magnetic_heading(at, math.atan2(FIELD[1], FIELD[0]), 1e3 * c.inv().apply(FIELD), *to)
     else:
         m = models.magnetic(at, FIELD, c.inv().apply(FIELD), *to)
     return residual[:m], h[:m], variance[:m]
@@ -88,6 +90,7 @@ KINDS = {
     Kind.ATTITUDE: 2e-5,
     Kind.BODY_VELOCITY: 1e-2,
     Kind.MAGNETIC: 1e-9,
+    "magnetic heading": 4e-5,
 }
 """What the steady velocity, acceleration and rate leave over the age."""
 
@@ -99,7 +102,8 @@ def test_the_truth_has_no_residual(kind, time):
     residual, h, variance = run(kind, instant(row(time)), row(time - AGE - delay), AGE)
     assert np.abs(residual).max() < KINDS[kind]
     assert np.isfinite(h).all()
-    np.testing.assert_allclose(variance, np.array([0.1, 0.2, 0.3])[: len(variance)] ** 2)
+    level = 1e3 * math.hypot(FIELD[0], FIELD[1]) if kind == "magnetic heading" else 1.0
+    np.testing.assert_allclose(variance, (np.array([0.1, 0.2, 0.3])[: len(variance)] / level) ** 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -175,3 +179,11 @@ def test_there_is_no_heading_when_the_nose_points_up():
     truth["q_nb"] = Rotation.from_euler("ZYX", [0.0, 89.9, 0.0], degrees=True).as_quat(scalar_first=True)
     residual, _, _ = run(Kind.HEADING, instant(truth), row(0.0), 0.0)
     assert len(residual) == 0
+
+
+def test_a_vertical_flux_tells_no_heading():
+    flat, arrays = instant(row(3.0)), (np.full((3, STATES), np.nan), np.full(3, np.nan), np.full(3, np.nan))
+    flat[6:10] = 1.0, 0.0, 0.0, 0.0
+    for level, rows in ((0.05, 0), (0.2, 1)):
+        flux = np.array([level, 0.0, 1.0])
+        assert models.magnetic_heading(flat, 0.0, flux, np.full(3, 0.1), 0.0, *arrays) == rows

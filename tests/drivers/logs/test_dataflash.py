@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.logs.dataflash import read_dataflash
+from drivers.logs.imu_log import IRON_S
 from nav.aiding import Kind
 from nav.errors import HilError
 from nav.rotation import euler_from_quaternion
@@ -168,7 +169,9 @@ def fixes_lat(make):
 
 def test_deviations_are_those_of_the_autopilots_filter(tmp_path):
     log = read(new_log(), tmp_path)
-    np.testing.assert_allclose(of(log, Kind.MAGNETIC)[0]["sigma"][:, :3], 2e-6, rtol=1e-6)
+    magnetic = of(log, Kind.MAGNETIC)[0]
+    lasting = np.sqrt(2.0 * IRON_S / np.median(np.diff(magnetic["time"])))
+    np.testing.assert_allclose(magnetic["sigma"][:, :3], 2e-6 * lasting, rtol=1e-6)
     np.testing.assert_allclose(of(log, Kind.BARO)[0]["sigma"][:, 0], 1.5)
 
 

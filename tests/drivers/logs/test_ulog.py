@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.logs.imu_log import ImuLog, steady
+from drivers.logs.imu_log import IRON_S, ImuLog, make_log, steady
 from drivers.logs.ulog import read_ulog
 from nav.aiding import AIDING, Kind
 from nav.errors import HilError
@@ -147,7 +147,8 @@ def base(n=500, mag=-2000, baro=-5000):
 
 def test_old_logs_carry_field_and_height_with_the_samples(tmp_path):
     log = read_ulog(made(tmp_path / "old.ulg", base(), EKF2_BARO_NOISE=2.0, EKF2_BARO_DELAY=30.0))
-    for kind, value, sigma, age in ((Kind.MAGNETIC, 20e-6, 5e-6, 0.002), (Kind.BARO, 77.0, 2.0, 0.035)):
+    lasting = np.sqrt(2.0 * IRON_S / 0.02)  # an error that lasts, at 50 Hz
+    for kind, value, sigma, age in ((Kind.MAGNETIC, 20e-6, 5e-6 * lasting, 0.002), (Kind.BARO, 77.0, 2.0, 0.035)):
         rows = log.aiding[log.aiding["kind"] == kind]
         assert len(rows) == 100, "once for each that is new"
         np.testing.assert_allclose(rows["value"][:, 0], value, rtol=1e-6)
@@ -195,3 +196,18 @@ def test_a_lone_leap_of_the_time_takes_no_other_sample_along():
     gap = np.array([1, 2, 2, 3, 5_000_000, 5_001_000, 5_002_000])
     assert steady(gap).tolist() == [True] * 2 + [False] + [True] * 4
     assert len(steady(np.zeros(0, np.int64))) == 0
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+def test_what_shakes_is_told_from_what_moves(averaged):
+    """White noise on a slow turn, as it is or in means of neighbours; across a gap nothing is compared."""
+    rng, t = np.random.default_rng(4), np.arange(20_000) * 4000
+    noise = rng.normal(0.0, 0.2, (len(t), 3))
+    values = noise + 3.0 * np.sin(2e-6 * t)[:, None]
+    if averaged:
+        values[1:] = 0.5 * (values[1:] + values[:-1])
+    values[10_000:] += 50.0
+    time_us = t + 1_000_000 * (np.arange(len(t)) >= 10_000)
+    log = make_log(time_us, values, values, time_us, np.tile([1.0, 0, 0, 0], (len(t), 1)), [])
+    expected = 0.2 * np.sqrt(0.5 if averaged else 1.0)
+    assert log.shake(log.rate) == pytest.approx(expected, rel=0.02)
