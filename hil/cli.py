@@ -149,24 +149,41 @@ def navigate(
     attitude: Annotated[str, typer.Option(help="Attitude method.")] = "two-sample",
     mechanization: Annotated[str, typer.Option(help="Mechanization.")] = "geographic",
     gravity: Annotated[str, typer.Option(help="Gravity model.")] = "normal",
+    aid: Annotated[Path | None, typer.Option(help="Measurements that aid: .csv, .npz or .parquet.")] = None,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Use later measurements too; needs --aid.")] = False,
     every: Annotated[float | None, typer.Option(min=0.0, help="Seconds between rows of the output.")] = None,
     as_json: Json = False,
 ) -> None:
     """Navigate logged increments offline."""
-    from hil.offline import IMU_HEADER, NAV_HEADER, read_start, read_table, thin, write_table
+    from hil.offline import IMU_HEADER, NAV_HEADER, read_init, thin
     from hil.offline import navigate as navigate_rows
+    from hil.tables import read_table, write_table
     from nav.strapdown import Strapdown
 
-    Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
-    table, start = read_table(imu_file, IMU_HEADER), read_start(init)
-    began = time.perf_counter()
-    rows = navigate_rows(table, start, attitude, mechanization, gravity)
+    core = Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
+    if smooth and aid is None:
+        raise HilError("--smooth needs measurements: give --aid FILE")
+    table, (start, config) = read_table(imu_file, IMU_HEADER), read_init(init)
+    header: tuple[str, ...] = NAV_HEADER
+    extra: dict[str, Any] = {}
+    if aid is None:
+        began = time.perf_counter()
+        rows = navigate_rows(table, start, attitude, mechanization, gravity)
+    else:
+        from hil.aid_file import read_aiding
+        from hil.offline_aided import AIDED_HEADER, navigate_aided
+
+        if config is None:
+            raise HilError(f"{init}: --aid needs the table [filter] in it, with grade and attitude_sigma_deg")
+        measurements, header = read_aiding(aid), AIDED_HEADER
+        began = time.perf_counter()
+        rows, extra = navigate_aided(table, start, config, measurements, core, smoothed=smooth)
     seconds = time.perf_counter() - began
     if every:
         rows = thin(rows, every)
-    write_table(out, NAV_HEADER, rows)
-    final = dict(zip(NAV_HEADER, rows[-1].tolist(), strict=True))
-    _report({"samples": len(table), "rows": len(rows), "seconds": seconds, "final": final}, as_json=as_json)
+    write_table(out, header, rows)
+    final = dict(zip(header, rows[-1].tolist(), strict=True))
+    _report({"samples": len(table), "rows": len(rows), "seconds": seconds, "final": final, **extra}, as_json=as_json)
 
 
 @app.command()
