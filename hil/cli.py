@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -114,6 +115,9 @@ def replay(
     speed: Speed = "1",
     record: Record = None,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
+    smooth: Annotated[
+        Path | None, typer.Option(help="Write the smoothed navigation to this file (.csv, .npz, .parquet).")
+    ] = None,
     assertion: Asserts = None,
     junit: Junit = None,
     as_json: Json = False,
@@ -133,7 +137,15 @@ def replay(
         check_plot(plot)
         order = replace(order, keep_trace=True)
     feeder = (run_player, (log, order.scenario, order.paced)) if over_bus else None
-    summary = _run(order, feeder, record, assertion, junit, as_json=as_json)
+
+    def smoothed() -> dict[str, Any]:
+        if smooth is None:
+            return {}
+        from hil.smoothing import smooth_recording
+
+        return {"smoothed": smooth_recording(log, order.scenario, smooth)}
+
+    summary = _run(order, feeder, record, assertion, junit, smoothed, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -368,10 +380,11 @@ def _run(
     record_to: Path | None,
     assertions: list[str] | None,
     junit: Path | None,
+    more: Callable[[], dict[str, Any]] = dict,
     *,
     as_json: bool,
 ) -> dict[str, Any]:
-    """Run a session to its end, show it, check the assertions; the summary."""
+    """Run a session to its end, show it with what `more` adds, check the assertions; the summary."""
     from hil.assertions import parse, write_junit
     from hil.console import RunView, print_summary
     from hil.session import Session
@@ -392,7 +405,10 @@ def _run(
                 raise
             raise RunFailed(str(error)) from error
     view.show_events()
-    summary = session.summary()
+    try:
+        summary = session.summary() | more()
+    except HilError as error:
+        raise RunFailed(str(error)) from error
     shown = {key: value for key, value in summary.items() if key != "trace"}
     if as_json:
         print(json.dumps(shown))
