@@ -36,7 +36,6 @@ def go_back(
     d: FloatArray,
     scalars: FloatArray,
     first: IntArray,
-    begin: bool,
     back: FloatArray,
     curvature: FloatArray,
     work: FloatArray,
@@ -46,16 +45,25 @@ def go_back(
 ) -> None:
     """Smooth the epochs of `x` (e, m), `spread` (e, m), `covariance` (e, 9, 9); `back` and `curvature` (l, L) go on.
 
-    At the first epoch they stay as they are behind it where it is a `begin`.
+    Parameters
+    ----------
+    phi, u, d : (e, 9, m), (e, m, m), (e, m) float
+        Of the interval that ends in each epoch; the factors after its measurements.
+    scalars : (r, 2 m + 2) float
+        h, k, s, nu of each scalar.
+    first : (e + 1,) int
+        Those of epoch i are `first[i]` to `first[i + 1]`.
+    back, curvature, work : (m,), (m, m), (3, m, m) float
+        l and L behind the last epoch, out: before the interval of the first; room to work in.
+    x, spread, covariance
+        Out: errors left, their variances, the covariance of the first nine.
     """
-    m = len(back)
     p, w = work[0], work[1, 0]
     for k in range(len(x) - 1, -1, -1):
         _fill_smoothed(u[k], d[k], back, curvature, p, w, x[k], spread[k], covariance[k])
         for i in range(first[k + 1] - 1, first[k] - 1, -1):
             _through_measurement(scalars[i], back, curvature, w)
-        if k > 0 or not begin:
-            _through_interval(phi[k], back, curvature, w[:m], work[2])
+        _through_interval(phi[k], back, curvature, w, work[2])
 
 
 @kernel
@@ -98,20 +106,28 @@ def _fill_smoothed(
 
 @kernel
 def _through_measurement(scalar: FloatArray, back: FloatArray, curvature: FloatArray, w: FloatArray) -> None:
+    """L = A^T L A + h h^T / s, A = I - k h, one factor after the other.
+
+    Expanded it would lose in rounding what the first fix leaves of a large doubt.
+    """
     m = len(back)
     h, gain, s, innovation = scalar[:m], scalar[m : 2 * m], scalar[2 * m], scalar[2 * m + 1]
-    along, twice = 0.0, 0.0
-    w[:] = 0.0
+    along = 0.0
     for i in range(m):
         along += gain[i] * back[i]
+        total = 0.0
+        for j in range(m):
+            total += curvature[i, j] * gain[j]
+        for j in range(m):
+            curvature[i, j] -= total * h[j]
+    w[:] = 0.0
+    for i in range(m):
         for j in range(m):
             w[j] += gain[i] * curvature[i, j]
     for i in range(m):
-        twice += gain[i] * w[i]
-    for i in range(m):
         back[i] -= h[i] * (along + innovation / s)
         for j in range(m):
-            curvature[i, j] += h[i] * h[j] * (twice + 1.0 / s) - h[i] * w[j] - w[i] * h[j]
+            curvature[i, j] += h[i] * (h[j] / s - w[j])
 
 
 @kernel

@@ -4,7 +4,7 @@ Modified Bryson-Frazier form (Bierman 1973). A vector l and a matrix L go back i
 an epoch, after its measurements, are zero as far as the filter knows, since they were taken off; P is their covariance:
 
     smoothed           x = -P l,    P_s = P - P L P
-    measurement h      l -= h (k l + nu / s),    L -= h w^T + w h^T - h h^T (k L k + 1 / s),    w = L k
+    measurement h      l -= h (k l + nu / s),    L = (I - k h)^T L (I - k h) + h^T h / s
     interval Phi       l = Phi^T l,    L = Phi^T L Phi
 
 where k is the gain, s the variance of the innovation nu. Nothing is inverted and the noise does not enter, so a parameter that
@@ -111,7 +111,7 @@ def smooth(record: Recorder) -> Smoothed:
         part = slice(mark.epoch, stop)
         _run_again(record, state, mark, stop, room)
         how = room.phi, room.u, room.d, room.scalars, room.first
-        go_back(*how, mark.begin, back, curvature, room.work, x[part], spread[part], covariance[part])
+        go_back(*how, back, curvature, room.work, x[part], spread[part], covariance[part])
         if mark.begin:
             back[:], curvature[:] = 0.0, 0.0
         stop = mark.epoch
@@ -128,10 +128,7 @@ def smooth(record: Recorder) -> Smoothed:
 
 
 class _Room:
-    """What a stretch of the filter leaves, for the way back.
-
-    `scalars` (m, 2 used + 2): h, k, s, nu of each; those of epoch i are `first[i]` to `first[i + 1]`.
-    """
+    """What a stretch of the filter leaves for the way back, as of `go_back`."""
 
     def __init__(self, m: int) -> None:
         self.phi, self.u, self.d = np.empty((STRIDE, 9, m)), np.empty((STRIDE, m, m)), np.empty((STRIDE, m))

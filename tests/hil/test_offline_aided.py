@@ -6,6 +6,7 @@ import math
 import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -286,6 +287,19 @@ def test_an_archive_that_lacks_a_column(tmp_path):
     np.savez(tmp_path / "aid.npz", kind=names, **{name: found[name] for name in found if name != "sigma_6"})
     with pytest.raises(HilError, match="sigma_6"):
         read_aiding(tmp_path / "aid.npz")
+
+
+def test_the_document_is_read(tmp_path):
+    """Its example, every key of the table, and every kind."""
+    text = (Path(__file__).resolve().parents[2] / "docs" / "cli.md").read_text()
+    example = next(part for part in text.split("```text\n") if part.startswith(AID_HEADER[0] + ",kind"))
+    (tmp_path / "aid.csv").write_text(example.split("```")[0])
+    gnss, baro = read_aiding(tmp_path / "aid.csv")
+    assert gnss["value"][2] == 153.1
+    assert baro["sigma"][0] == 0.3
+    rows = "".join(row for row in text.splitlines() if row.startswith("| `"))
+    assert all(f"`{name}`" in rows for name in [*FilterConfig.model_fields, *(kind.name.lower() for kind in Kind)])
+    assert all(f"`{name}`" in text for name in AIDED_HEADER[10:])
 
 
 def test_the_settings_reach_the_filter():

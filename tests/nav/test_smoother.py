@@ -274,6 +274,24 @@ def test_a_second_start_is_a_run_of_its_own():
         smooth(Recorder())
 
 
+def test_a_start_that_knows_nothing_is_found_from_behind():
+    """Doubts of 100 km and 1 km/s leave no rounding: the smoothed start is as sure as from doubts that are small beside them."""
+    sure = []
+    for doubt in (1e3, 1e5):
+        recorder = Recorder()
+        found, row = navigator(recorder=recorder), MOTION.truth([0.0])[0]
+        place = row["lat"] + 2e3 / 6.37e6 * (doubt > 1e3), row["lon"], row["height"]
+        sigma = np.array([doubt] * 3 + [1e-2 * doubt] * 3 + [0.01, 0.01, 0.1])
+        found.start(0.0, *place, row["vel_n"], row["q_nb"], sigma)
+        found.aid(gnss_rows(MOTION.truth(0.2 * np.arange(1, 150)), np.random.default_rng(4)))
+        found.process(exact().rows(0, 3000))
+        smoothed = smooth(recorder)
+        assert np.abs(wrong(smoothed.time, smoothed.position, smoothed.velocity, smoothed.attitude)[:, :3]).max() < 2.0
+        assert np.linalg.eigvalsh(smoothed.covariance).min() > 0.0
+        sure.append(smoothed.sigma[0, :6])
+    np.testing.assert_allclose(sure[1], sure[0], rtol=0.01)
+
+
 def test_an_hour_of_all_states_fits():
     """35 states, 50 intervals a second, GNSS, magnetometer and barometer: the record and the result of an hour, below 1 GB."""
     recorder = Recorder()
