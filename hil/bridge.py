@@ -39,6 +39,7 @@ from hil.world.truth import TruthKeeper
 from nav.aiding import Kind
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
+from nav.filter.record import Recorder
 from nav.filter.states import SENSOR_BLOCKS, Block, tuning
 from nav.gaps import GapPolicy
 from nav.increments import HeadIncrements, ImuIncrements, IntArray
@@ -161,13 +162,13 @@ def _three(vector: NDArray[np.float64]) -> tuple[float, float, float]:
 
 
 class Loop:
-    """The state of one run: driver, navigator and what is counted."""
+    """The state of one run: driver, navigator and what is counted; a `recorder` notes what the filter does."""
 
-    def __init__(self, order: LoopOrder, outlets: Outlets) -> None:
+    def __init__(self, order: LoopOrder, outlets: Outlets, recorder: Recorder | None = None) -> None:
         scenario = order.scenario
         self.scenario = scenario
         self.driver: FrameDriver = make_driver(scenario.driver)
-        self.navigator = Navigator(settings_of(scenario))
+        self.navigator = Navigator(settings_of(scenario), recorder)
         self.finished = False
         """The scenario's duration is over."""
         self._aiding = AidingDecoder()
@@ -440,7 +441,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             taken = batch[:n]
             _record(taken, outlets, order.paced)
             if order.file is not None and taken["reserved"][:, 0].any():
-                got = _take_with_events(loop, taken)
+                got = take_with_events(loop, taken)
             else:
                 got = loop.take(taken)
             if got:
@@ -455,7 +456,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             loop.obey(event)
 
 
-def _take_with_events(loop: Loop, taken: FrameArray) -> bool:
+def take_with_events(loop: Loop, taken: FrameArray) -> bool:
+    """Take recorded frames, the events among them in their place; True when there was a sample."""
     got, start = False, 0
     for mark in np.flatnonzero(taken["reserved"][:, 0] == EVENT):
         if mark > start:

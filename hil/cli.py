@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
@@ -118,6 +119,9 @@ def replay(
         list[str] | None,
         typer.Option(help="KIND:START:END: keep this aiding from the navigator, gnss:120:140 (seconds)."),
     ] = None,
+    smooth: Annotated[
+        Path | None, typer.Option(help="Write the smoothed navigation to this file (.csv, .npz, .parquet).")
+    ] = None,
     assertion: Asserts = None,
     junit: Junit = None,
     as_json: Json = False,
@@ -137,7 +141,15 @@ def replay(
         check_plot(plot)
         order = replace(order, keep_trace=True)
     feeder = (run_player, (log, order.scenario, order.paced)) if over_bus else None
-    summary = _run(order, feeder, record, assertion, junit, as_json=as_json)
+
+    def smoothed() -> dict[str, Any]:
+        if smooth is None:
+            return {}
+        from hil.smoothing import smooth_recording
+
+        return {"smoothed": smooth_recording(log, order.scenario, smooth)}
+
+    summary = _run(order, feeder, record, assertion, junit, smoothed, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -153,24 +165,41 @@ def navigate(
     attitude: Annotated[str, typer.Option(help="Attitude method.")] = "two-sample",
     mechanization: Annotated[str, typer.Option(help="Mechanization.")] = "geographic",
     gravity: Annotated[str, typer.Option(help="Gravity model.")] = "normal",
+    aid: Annotated[Path | None, typer.Option(help="Measurements that aid: .csv, .npz or .parquet.")] = None,
+    smooth: Annotated[bool, typer.Option("--smooth", help="Use later measurements too; needs --aid.")] = False,
     every: Annotated[float | None, typer.Option(min=0.0, help="Seconds between rows of the output.")] = None,
     as_json: Json = False,
 ) -> None:
     """Navigate logged increments offline."""
-    from hil.offline import IMU_HEADER, NAV_HEADER, read_start, read_table, thin, write_table
+    from hil.offline import IMU_HEADER, NAV_HEADER, read_init, thin
     from hil.offline import navigate as navigate_rows
+    from hil.tables import read_table, write_table
     from nav.strapdown import Strapdown
 
-    Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
-    table, start = read_table(imu_file, IMU_HEADER), read_start(init)
-    began = time.perf_counter()
-    rows = navigate_rows(table, start, attitude, mechanization, gravity)
+    core = Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
+    if smooth and aid is None:
+        raise HilError("--smooth needs measurements: give --aid FILE")
+    table, (start, config) = read_table(imu_file, IMU_HEADER), read_init(init)
+    header: tuple[str, ...] = NAV_HEADER
+    extra: dict[str, Any] = {}
+    if aid is None:
+        began = time.perf_counter()
+        rows = navigate_rows(table, start, attitude, mechanization, gravity)
+    else:
+        from hil.aid_file import read_aiding
+        from hil.offline_aided import AIDED_HEADER, navigate_aided
+
+        if config is None:
+            raise HilError(f"{init}: --aid needs the table [filter] in it, with grade and attitude_sigma_deg")
+        measurements, header = read_aiding(aid), AIDED_HEADER
+        began = time.perf_counter()
+        rows, extra = navigate_aided(table, start, config, measurements, core, smoothed=smooth)
     seconds = time.perf_counter() - began
     if every:
         rows = thin(rows, every)
-    write_table(out, NAV_HEADER, rows)
-    final = dict(zip(NAV_HEADER, rows[-1].tolist(), strict=True))
-    _report({"samples": len(table), "rows": len(rows), "seconds": seconds, "final": final}, as_json=as_json)
+    write_table(out, header, rows)
+    final = dict(zip(header, rows[-1].tolist(), strict=True))
+    _report({"samples": len(table), "rows": len(rows), "seconds": seconds, "final": final, **extra}, as_json=as_json)
 
 
 @app.command()
@@ -355,10 +384,11 @@ def _run(
     record_to: Path | None,
     assertions: list[str] | None,
     junit: Path | None,
+    more: Callable[[], dict[str, Any]] = dict,
     *,
     as_json: bool,
 ) -> dict[str, Any]:
-    """Run a session to its end, show it, check the assertions; the summary."""
+    """Run a session to its end, show it with what `more` adds, check the assertions; the summary."""
     from hil.assertions import parse, write_junit
     from hil.console import RunView, print_summary
     from hil.session import Session
@@ -379,7 +409,10 @@ def _run(
                 raise
             raise RunFailed(str(error)) from error
     view.show_events()
-    summary = session.summary()
+    try:
+        summary = session.summary() | more()
+    except HilError as error:
+        raise RunFailed(str(error)) from error
     shown = {key: value for key, value in summary.items() if key != "trace"}
     if as_json:
         print(json.dumps(shown))

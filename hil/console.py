@@ -130,6 +130,9 @@ def print_summary(summary: dict[str, Any]) -> None:
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")
+    if "smoothed" in summary:
+        smoothed = summary["smoothed"]
+        table.add_row("smoothed", f"{smoothed['rows']} rows to {smoothed['file']}")
     if "problem" in summary:
         table.add_row("problem", escape(summary["problem"]))
     console.print(table)
@@ -140,6 +143,8 @@ def print_summary(summary: dict[str, Any]) -> None:
     ):
         if summary.get(key):
             _print_spreads(console, title, summary[key])
+    if "error" in summary.get("smoothed", {}):
+        _print_spreads(console, "error of the smoothed navigation", summary["smoothed"]["error"])
     for problem in summary.get("problems", []):
         print(problem, file=sys.stderr)
 

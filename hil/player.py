@@ -58,7 +58,7 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         The file cannot be read or is of no kind that is known.
     """
     suffix = path.suffix.lower()
-    if suffix in _IMU_LOGS and not is_own(path):
+    if is_imu_log(path):
         log = _IMU_LOGS[suffix](path)
         scenario = load(scenario_file) if scenario_file else _board_scenario(path, log)
         reference = Reference(
@@ -152,7 +152,7 @@ def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _:
         sent = 0
         pacer = Pacer()
         try:
-            for due_s, batch in _timed(path, one_by_one=paced):
+            for due_s, batch in timed(path, one_by_one=paced):
                 if control.stop or (paced and not pacer.wait(due_s, lambda: control.stop)):
                     break
                 port.send(batch)
@@ -166,9 +166,20 @@ def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _:
         answer.close()
 
 
-def _timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]]:
-    """(seconds from the start, frames) of a recording."""
-    if path.suffix.lower() in _IMU_LOGS and not is_own(path):
+def is_imu_log(path: Path) -> bool:
+    """Whether `path` is a flight log, which holds no frames.
+
+    Raises
+    ------
+    HilError
+        The file cannot be read.
+    """
+    return path.suffix.lower() in _IMU_LOGS and not is_own(path)
+
+
+def timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]]:
+    """(seconds from the start, frames) of a recording; events are left out."""
+    if is_imu_log(path):
         yield from _head_frames(_IMU_LOGS[path.suffix.lower()](path), 1 if one_by_one else CHUNK)
         return
     source = FileSource(path, paced=False)

@@ -17,6 +17,7 @@ from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.errors import HilError
 from nav.filter.aided import AidedNavigator
 from nav.filter.aided import Settings as FilterSettings
+from nav.filter.record import Recorder
 from nav.filter.states import GYRO_BIAS, Tuning
 from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
@@ -109,7 +110,7 @@ class Event:
 
 
 class Navigator:
-    """See the module.
+    """See the module; what the filter does is noted in a `recorder`, if there is one.
 
     Raises
     ------
@@ -117,10 +118,10 @@ class Navigator:
         Unknown method or mechanization, ``level`` without a heading.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, recorder: Recorder | None = None) -> None:
         self._core = Strapdown(settings.attitude, settings.mechanization, settings.gravity)
         aiding = settings.aiding
-        self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter)
+        self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter, recorder)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -256,8 +257,7 @@ class Navigator:
             return
         sigma = self.settings.aiding.sigma.copy()
         sigma[6:9] = np.maximum(sigma[6:9], [sigma_tilt, sigma_tilt, sigma_heading])
-        self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma)
-        self._aided.estimates[GYRO_BIAS] = self.gyro_bias
+        self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma, self.gyro_bias)
 
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):

@@ -14,100 +14,30 @@ waits.
 import math
 from bisect import bisect_right, insort
 from collections import deque
-from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from nav.aiding import Kind
+from nav.checks import read_array
 from nav.errors import HilError
-from nav.filter import health as gates
-from nav.filter import measurements as models
-from nav.filter.error_state import MEASURED, ErrorState
-from nav.filter.health import Channel, ChannelHealth, Trust
-from nav.filter.states import BAROMETER_BIAS, GNSS_DELAY, LEVER_ARM, STATES, Tuning, correct_one
+from nav.filter.correction import Correction, Judged, Restart, Table
+from nav.filter.health import ChannelHealth
+from nav.filter.interval import add_one, gather
+from nav.filter.record import Recorder
+from nav.filter.rows import Row, checked
+from nav.filter.settings import Settings
+from nav.filter.states import Tuning
 from nav.increments import FloatArray, ImuIncrements
-from nav.kernel import inline_kernel, kernel
 from nav.step import POLE
 from nav.strapdown import Strapdown
 
-_VALUES = {
-    Kind.GNSS: 6,
-    Kind.BARO: 1,
-    Kind.MAGNETIC: 3,
-    Kind.HEADING: 1,
-    Kind.ATTITUDE: 4,
-    Kind.BODY_VELOCITY: 3,
-    Kind.ZERO_RATE: 0,
-    Kind.GRAVITY: 0,
-}
-_GNSS = (
-    (Channel.GNSS_POSITION, models.gnss_position, slice(0, 3)),
-    (Channel.GNSS_VELOCITY, models.gnss_velocity, slice(3, 6)),
-)
+__all__ = ["AidedNavigator", "Answers", "Judged", "Restart", "Settings"]
+
 _NOTHING = np.zeros(3)
 _ROOM = 4096
 """Samples that there is room for at the start."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How the filter is run.
-
-    Attributes
-    ----------
-    predict_s : float
-        Length of an interval, s.
-    buffer_s : float
-        How late a measurement may come, s.
-    gate : float
-        Probability that a right measurement is accepted.
-    restart_s : float
-        A position source that is rejected for so long, s, is right and the filter has diverged: it restarts there. `inf`: never.
-    lever_arm : (3,) float
-        From the navigated point (the sensor, if it is not moved) to the GNSS antenna, b, m, as first known.
-    delay : float
-        How much older GNSS is than it says, s, as far as known: it is taken at that time. The estimated delay is what is left.
-    field_n : (3,) float, optional
-        Magnetic flux in n, T; without it no magnetic row is taken.
-    magnetic_heading : bool
-        Take of a magnetic row nothing but where its level part points: on a scale of its own, or where the field is disturbed.
-    """
-
-    predict_s: float = 0.02
-    buffer_s: float = 2.0
-    gate: float = 0.999
-    restart_s: float = 30.0
-    lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    delay: float = 0.0
-    field_n: tuple[float, float, float] | None = None
-    magnetic_heading: bool = False
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be."""
-        if not (0.0 < self.predict_s <= 1.0 and self.predict_s <= self.buffer_s < math.inf):
-            raise HilError("filter: predict_s must be in (0, 1] and buffer_s finite and not shorter")
-        if not (0.5 <= self.gate < 1.0 and self.restart_s > 0.0):
-            raise HilError("filter: gate must be in [0.5, 1) and restart_s positive")
-
-
-class Judged(NamedTuple):
-    """One judged measurement."""
-
-    time: float
-    channel: Channel
-    source: int
-    freedom: int
-    nis: float
-    accepted: bool
-
-
-class Restart(NamedTuple):
-    """The filter had diverged and was started again, at `time`, s."""
-
-    time: float
-    source: int
 
 
 class Answers(NamedTuple):
@@ -118,20 +48,12 @@ class Answers(NamedTuple):
     attitude: FloatArray
 
 
-class _Row(NamedTuple):
-    key: tuple[float, ...]
-    kind: Kind
-    source: int
-    value: FloatArray
-    sigma: FloatArray
-
-
 class _Memory(NamedTuple):
     number: int
     time: float
     core: tuple[Any, ...]
     own: tuple[FloatArray, ...]
-    table: dict[tuple[Channel, int], FloatArray]
+    table: Table
 
 
 class AidedNavigator:
@@ -144,6 +66,8 @@ class AidedNavigator:
     tuning : Tuning
         What the sensors are worth and what is estimated (:func:`nav.filter.states.tuning`).
     settings : Settings
+    recorder : Recorder, optional
+        Notes what :mod:`nav.filter.smoother` needs.
 
     Attributes
     ----------
@@ -155,23 +79,18 @@ class AidedNavigator:
         Measurements refused because they were older than the buffer.
     """
 
-    def __init__(self, core: Strapdown, tuning: Tuning, settings: Settings | None = None) -> None:
+    def __init__(
+        self, core: Strapdown, tuning: Tuning, settings: Settings | None = None, recorder: Recorder | None = None
+    ) -> None:
         self.settings = settings or Settings()
-        self._core, self._filter = core, ErrorState(tuning)
-        self._gate = [gates.quantile(self.settings.gate, m + 1) for m in range(MEASURED)]
-        self._field = np.zeros(3) if self.settings.field_n is None else np.array(self.settings.field_n, float)
-        self._declination = math.atan2(self._field[1], self._field[0])
-        self.estimates = np.zeros(STATES)
-        self._sums, self._before, self._instant = np.zeros(7), np.zeros(10), np.zeros(models.INSTANT)
+        self._core = core
+        self._correction = Correction(core, tuning, self.settings, recorder)
+        self._filter, self.estimates = self._correction.filter, self._correction.estimates
+        self._sums, self._before = np.zeros(7), np.zeros(10)
         self._last, self._one = np.zeros(6), np.zeros(6)
-        self._h, self._residual = np.zeros((MEASURED, STATES)), np.zeros(MEASURED)
-        self._variance, self._believed = np.zeros(MEASURED), np.zeros(MEASURED)
-        self._samples, self._sigma = ImuIncrements.empty(_ROOM), np.zeros(9)
-        self._table: dict[tuple[Channel, int], FloatArray] = {}
-        self._rows: list[_Row] = []
+        self._samples = ImuIncrements.empty(_ROOM)
+        self._rows: list[Row] = []
         self._memories: deque[_Memory] = deque()
-        self._judged: list[Judged] = []
-        self._restarts: list[Restart] = []
         self._room(256)
         self.time, self.too_late = -math.inf, 0
 
@@ -184,28 +103,28 @@ class AidedNavigator:
         vel_n: FloatArray,
         q_nb: FloatArray,
         sigma: FloatArray,
+        gyro_bias: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         """Begin at `time`, s, from a solution (rad, m, m/s) with independent errors, `sigma` (9,): m, m/s, rad.
 
-        The parameters begin at what the settings say. What came before is forgotten.
+        The parameters begin at what the settings say and the gyros' bias at `gyro_bias` (3,), rad/s; so they do after a
+        restart. What came before is forgotten.
 
         Raises
         ------
         HilError
-            `sigma` is not finite or negative.
+            `sigma` is not finite or negative, or `gyro_bias` is not finite.
         """
-        given = np.asarray(sigma, float)
-        if given.shape != (9,) or not (np.isfinite(given) & (given >= 0.0)).all():
-            raise HilError("filter: sigma of the start must be nine numbers, finite and not negative")
-        self._sigma[:] = given
+        given, bias = np.asarray(sigma, float), read_array("filter: gyro_bias of the start", gyro_bias, 3)
+        if given.shape != (9,) or not (np.isfinite(given) & (given >= 0.0)).all() or not np.isfinite(bias).all():
+            raise HilError("filter: sigma of the start must be nine numbers, finite and not negative, gyro_bias finite")
         self._core.start(lat, lon, height, vel_n, q_nb)
-        self._filter.start(given)
-        self._begin_parameters()
-        self._sums[:], self._instant[:] = 0.0, 0.0
-        self._before[:] = self._instant[:10] = self._core.solution
+        self._correction.start(time, given, bias)
+        self._sums[:] = 0.0
+        self._before[:] = self._core.solution
         self.time, self._number, self._count, self._first, self._next = time, 0, 0, 0, 0
-        for held in (self._table, self._rows, self._memories, self._judged, self._restarts):
-            held.clear()
+        self._rows.clear()
+        self._memories.clear()
         self._remember()
 
     def process(self, imu: ImuIncrements) -> Answers:
@@ -260,7 +179,7 @@ class AidedNavigator:
         s = self._samples
         kept = s.time, s.step, s.dtheta, s.dvel
         how = self.settings.predict_s, self._until(), self.estimates, self._sums, self._last, self._one
-        ended, *corrected = _add_one(kept, row, time, step, x, y, z, vx, vy, vz, *how)
+        ended, *corrected = add_one(kept, row, time, step, x, y, z, vx, vy, vz, *how)
         if self._core.push(step, *corrected) == POLE:
             self._core.hand_over("wander")
             self._core.push(step, *corrected)
@@ -281,13 +200,12 @@ class AidedNavigator:
         """
         self._check_started()
         late = math.inf
-        for row in [_row(entry, self.settings) for entry in np.atleast_1d(rows)]:
-            time = row.key[0]
-            if time <= self._memories[0].time:
+        for row in [checked(entry, self.settings) for entry in np.atleast_1d(rows)]:
+            if row.time <= self._memories[0].time:
                 self.too_late += 1
                 continue
-            insort(self._rows, row, key=_key)
-            late = min(late, time)
+            insort(self._rows, row, key=attrgetter("key"))
+            late = min(late, row.time)
         if late <= self.time:
             self._recall(late)
             self._run(self._answers(self._count - self._number))
@@ -315,27 +233,16 @@ class AidedNavigator:
     @property
     def health(self) -> list[ChannelHealth]:
         """Of every source heard so far."""
-        return [
-            ChannelHealth(
-                *key,
-                accepted=int(row[gates.ACCEPTED]),
-                rejected=int(row[gates.REJECTED]),
-                nis=float(row[gates.NIS]),
-                nis_mean=float(row[gates.NIS_MEAN]),
-                inflation=gates.inflation(row),
-                trust=Trust(int(row[gates.TRUST])),
-            )
-            for key, row in sorted(self._table.items())
-        ]
+        return self._correction.health()
 
     def judged(self) -> list[Judged]:
         """Measurements judged since the last call; those that are taken again by a late one come again."""
-        judged, self._judged = self._judged, []
+        judged, self._correction.judged = self._correction.judged, []
         return judged
 
     def restarts(self) -> list[Restart]:
         """Restarts since the last call."""
-        restarts, self._restarts = self._restarts, []
+        restarts, self._correction.restarts = self._correction.restarts, []
         return restarts
 
     def _check_started(self) -> None:
@@ -361,7 +268,7 @@ class AidedNavigator:
 
     def _until(self) -> float:
         """Time of the next measurement that waits."""
-        return self._rows[self._next].key[0] if self._next < len(self._rows) else math.inf
+        return self._rows[self._next].time if self._next < len(self._rows) else math.inf
 
     def _run(self, out: Answers) -> None:
         """Take all samples that are not taken yet; `out` begins at the first of them."""
@@ -370,7 +277,7 @@ class AidedNavigator:
             first, stop = self._number - self._first, self._count - self._first
             data = self._samples.time, self._samples.step, self._samples.dtheta, self._samples.dvel
             room = self._sums, self._last, self._turned, self._pushed
-            n, ended = _gather(*data, first, stop, self.settings.predict_s, self._until(), self.estimates, *room)
+            n, ended = gather(*data, first, stop, self.settings.predict_s, self._until(), self.estimates, *room)
             here, begin = slice(first, first + n), self._number - base
             there = tuple(array[begin : begin + n] for array in out)
             self._core.advance(self._samples.step[here], self._turned[:n], self._pushed[:n], _NOTHING, *there)
@@ -383,109 +290,27 @@ class AidedNavigator:
 
     def _end(self) -> None:
         """End an interval: predict, take what is due, remember."""
-        self._filter.predict(self._before, self._core.solution, self._sums)
-        self._instant[:10], self._instant[models.LAST_PART] = self._core.solution, self._last
-        if self._sums[0] > 0.0:
-            self._instant[models.MEAN_PART] = self._sums[1:] / self._sums[0]
-        while self._next < len(self._rows) and self._rows[self._next].key[0] <= self.time:
-            self._take(self._rows[self._next])
+        self._correction.predict(self.time, self._before, self._sums, self._last)
+        while self._until() <= self.time:
+            self._correction.take(self._rows[self._next])
             self._next += 1
+        self._correction.end()
         self._before[:] = self._core.solution
         self._sums[:] = 0.0
         self._remember()
 
-    def _take(self, row: _Row) -> None:
-        at, age, to = self._instant, self.time - row.key[0], (self._h, self._residual, self._variance)
-        value, sigma = row.value, row.sigma
-        if row.kind == Kind.GNSS:
-            self._take_gnss(row)
-        elif row.kind == Kind.BARO:
-            offset = float(self.estimates[BAROMETER_BIAS][0])
-            self._judge(Channel.BARO, row.source, models.barometer(at, offset, value, sigma, age, *to))
-        elif row.kind == Kind.MAGNETIC:
-            if self.settings.magnetic_heading:
-                m = models.magnetic_heading(at, self._declination, value, sigma, age, *to)
-            else:
-                m = models.magnetic(at, self._field, value, sigma, age, *to)
-            self._judge(Channel.MAGNETIC, row.source, m)
-        elif row.kind == Kind.HEADING:
-            self._judge(Channel.HEADING, row.source, models.heading(at, value, sigma, age, *to))
-        elif row.kind == Kind.ATTITUDE:
-            self._judge(Channel.ATTITUDE, row.source, models.attitude(at, value, sigma, age, *to))
-        elif row.kind == Kind.BODY_VELOCITY:
-            self._judge(Channel.BODY_VELOCITY, row.source, models.body_velocity(at, value, sigma, age, *to))
-        elif row.kind == Kind.ZERO_RATE:
-            self._judge(Channel.ZERO_RATE, row.source, models.earth_rate(at, sigma, *to))
-        else:
-            self._judge(Channel.GRAVITY, row.source, models.gravity(at, sigma, *to))
-
-    def _take_gnss(self, row: _Row) -> None:
-        """Position and velocity, each by its own gate; and the restart."""
-        for channel, model, part in _GNSS:
-            m = self._gnss(model, row, part)
-            rejected_since = self._judge(channel, row.source, m)
-            if channel == Channel.GNSS_POSITION and m == 3 and self.time - rejected_since >= self.settings.restart_s:
-                self._restart(row)
-                return
-
-    def _gnss(self, model: Any, row: _Row, part: slice) -> int:
-        arm, delay = self.estimates[LEVER_ARM], float(self.estimates[GNSS_DELAY][0])
-        at, age, to = self._instant, self.time - row.key[0], (self._h, self._residual, self._variance)
-        return int(model(at, arm, delay, row.value[part], row.sigma[part], age, *to))
-
-    def _judge(self, channel: Channel, source: int, m: int) -> float:
-        """Take or reject a measurement of `m` rows; since when its source has been rejected, s, NaN if it is not."""
-        if m == 0:
-            return math.nan
-        row = self._table.get((channel, source))
-        if row is None:
-            row = self._table[channel, source] = np.zeros(gates.TABLE)
-            gates.clear(row)
-        self._believed[:] = gates.inflation(row) * self._variance
-        nis, spread = self._filter.examine(self._h, self._residual, self._believed, m)
-        gate = self._gate[m - 1]
-        accepted = gates.judge(row, m, self._residual, self._variance, spread, nis, gate, self.time)
-        self._judged.append(Judged(self.time, channel, source, m, nis, accepted))
-        if accepted:
-            x = self._filter.absorb(self._h, self._residual, self._believed, m)
-            self._core.correct(x[0:3], x[3:6], x[6:9])
-            self.estimates[9:] += x[9:]
-            self._instant[:10] = self._core.solution
-        return float(row[gates.SINCE])
-
-    def _restart(self, row: _Row) -> None:
-        """Begin again where GNSS says, with the attitude as it is, three times less sure of it than before."""
-        zero = np.zeros(3)
-        self._sigma[6:9] = np.minimum(3.0 * self._sigma[6:9], 1.0)
-        for _, model, part in _GNSS:
-            if self._gnss(model, row, part) == 3:
-                errors = [zero, zero, zero]
-                errors[part.start // 3] = self._residual
-                self._core.correct(*errors)
-                self._instant[:10] = self._core.solution
-                self._sigma[part] = np.sqrt(self._variance)
-        self._filter.start(self._sigma)
-        self._begin_parameters()
-        self._table.clear()
-        self._restarts.append(Restart(self.time, row.source))
-
-    def _begin_parameters(self) -> None:
-        self.estimates[:] = 0.0
-        self.estimates[LEVER_ARM] = self.settings.lever_arm
-
     def _own(self) -> tuple[FloatArray, ...]:
-        f = self._filter
-        return f.u, f.d, f.turn, self.estimates, self._before, self._instant, self._last, self._sigma
+        return *self._correction.own(), self._before, self._last
 
     def _remember(self) -> None:
-        table = {key: row.copy() for key, row in self._table.items()}
+        table = {key: row.copy() for key, row in self._correction.table.items()}
         own = tuple(array.copy() for array in self._own())
         self._memories.append(_Memory(self._number, self.time, self._core.memory(), own, table))
         old = len(self._memories)
         while len(self._memories) > 1 and self._memories[1].time <= self.time - self.settings.buffer_s:
             self._memories.popleft()
         if len(self._memories) < old:
-            done = bisect_right(self._rows, self._memories[0].time, key=_time)
+            done = bisect_right(self._rows, self._memories[0].time, key=attrgetter("time"))
             del self._rows[:done]
             self._next -= done
 
@@ -498,11 +323,9 @@ class AidedNavigator:
         self._core.recall(memory.core)
         for array, then in zip(self._own(), memory.own, strict=True):
             array[:] = then
-        self._table = {key: row.copy() for key, row in memory.table.items()}
+        self._correction.recall(memory.time, memory.table)
         self._sums[:] = 0.0
-        self._next = bisect_right(self._rows, self.time, key=_time)
-        self._judged = [one for one in self._judged if one.time <= self.time]
-        self._restarts = [one for one in self._restarts if one.time <= self.time]
+        self._next = bisect_right(self._rows, self.time, key=attrgetter("time"))
 
     def _room(self, n: int) -> None:
         self._out = Answers(np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)))
@@ -514,112 +337,6 @@ class AidedNavigator:
         return Answers(*(array[:n] for array in self._out))
 
 
-def _key(row: _Row) -> tuple[float, ...]:
-    return row.key
-
-
-def _time(row: _Row) -> float:
-    return row.key[0]
-
-
-def _row(row: Any, settings: Settings) -> _Row:
-    """A checked row, and its place in the order: by time, and the same for rows of one time, however they came."""
-    time, number, source = float(row["time"]), int(row["kind"]), int(row["source"])
-    if number not in _VALUES:
-        raise HilError(f"aiding row at {time:g} s: unknown kind {number}; there is: {', '.join(k.name for k in Kind)}")
-    kind = Kind(number)
-    if kind == Kind.MAGNETIC and settings.field_n is None:
-        raise HilError("aiding row MAGNETIC: no magnetic field to compare with: give Settings.field_n")
-    value, sigma = np.array(row["value"], float), np.array(row["sigma"], float)
-    used = value[: _VALUES[kind]]
-    if not (math.isfinite(time) and np.isfinite(used).all() and (sigma > 0.0).all()):
-        raise HilError(f"aiding row {kind.name} at {time:g} s: a value is no number, or a sigma is not positive")
-    if kind == Kind.GNSS:
-        time -= settings.delay
-    return _Row((time, number, source, *map(float, value), *map(float, sigma)), kind, source, value, sigma)
-
-
 def _copy(source: ImuIncrements, target: ImuIncrements) -> None:
     target.time[:], target.step[:] = source.time, source.step
     target.dtheta[:], target.dvel[:] = source.dtheta, source.dvel
-
-
-@kernel
-def _gather(
-    time: FloatArray,
-    step: FloatArray,
-    dtheta: FloatArray,
-    dvel: FloatArray,
-    first: int,
-    stop: int,
-    period: float,
-    until: float,
-    estimates: FloatArray,
-    sums: FloatArray,
-    last: FloatArray,
-    turned: FloatArray,
-    pushed: FloatArray,
-) -> tuple[int, bool]:
-    """Correct samples from `first` up to the end of the interval; how many, and whether it has ended.
-
-    `sums` (7,) goes on: length, increments. `last` (6,) out: rate and force of the last sample.
-    """
-    n, ended = 0, False
-    while first + n < stop and not ended:
-        k = first + n
-        ended = _add(estimates, time[k], step[k], dtheta[k], dvel[k], period, until, sums, last, turned[n], pushed[n])
-        n += 1
-    return n, ended
-
-
-@inline_kernel
-def _add(
-    estimates: FloatArray,
-    time: float,
-    step: float,
-    dtheta: FloatArray,
-    dvel: FloatArray,
-    period: float,
-    until: float,
-    sums: FloatArray,
-    last: FloatArray,
-    turned: FloatArray,
-    pushed: FloatArray,
-) -> bool:
-    """Correct a sample and add it to the interval; whether that ends with it."""
-    correct_one(estimates, step, dtheta, dvel, turned, pushed)
-    sums[0] += step
-    for i in range(3):
-        sums[1 + i] += turned[i]
-        sums[4 + i] += pushed[i]
-        if step > 0.0:
-            last[i], last[3 + i] = turned[i] / step, pushed[i] / step
-    return sums[0] + 0.5 * step >= period or time >= until
-
-
-@kernel
-def _add_one(
-    samples: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
-    row: int,
-    time: float,
-    step: float,
-    x: float,
-    y: float,
-    z: float,
-    vx: float,
-    vy: float,
-    vz: float,
-    period: float,
-    until: float,
-    estimates: FloatArray,
-    sums: FloatArray,
-    last: FloatArray,
-    one: FloatArray,
-) -> tuple[bool, float, float, float, float, float, float]:
-    """Keep a sample in `row` and add it; `one` (6,) is room to work in. Whether the interval ends; corrected increments."""
-    samples[0][row], samples[1][row] = time, step
-    dtheta, dvel = samples[2][row], samples[3][row]
-    dtheta[0], dtheta[1], dtheta[2] = x, y, z
-    dvel[0], dvel[1], dvel[2] = vx, vy, vz
-    ended = _add(estimates, time, step, dtheta, dvel, period, until, sums, last, one[:3], one[3:])
-    return ended, one[0], one[1], one[2], one[3], one[4], one[5]

@@ -254,6 +254,8 @@ class ErrorState:
         Factors; the columns of U are the rows of `u`.
     turn : (3,) float
         Attitude taken off the navigator since the last prediction, rad.
+    transition : (9, n) float
+        The navigator's rows of the last one, the reset before it included; the parameters stay as they are.
     """
 
     def __init__(self, tuning: Tuning) -> None:
@@ -262,7 +264,7 @@ class ErrorState:
         n = len(self.used)
         self.u, self.d, self.turn = np.eye(n), np.zeros(n), np.zeros(3)
         self._x, self._s = np.zeros(STATES), np.zeros((MEASURED, MEASURED))
-        self._nine, self._gain, self._phi = np.zeros((3, 9, 9)), np.zeros((9, 6)), np.zeros((9, n))
+        self._nine, self._gain, self.transition = np.zeros((3, 9, 9)), np.zeros((9, 6)), np.eye(9, n)
         self._w, self._weight = np.zeros((n, 2 * n + 6)), np.zeros(2 * n + 6)
         self._work = np.zeros((MEASURED, n + 1))
 
@@ -284,7 +286,7 @@ class ErrorState:
         """
         t = self.tuning
         how = self.used, t.white, t.by_rate, t.walk
-        room = self._nine, self._gain, self._phi, self.u, self.d, self._w, self._weight
+        room = self._nine, self._gain, self.transition, self.u, self.d, self._w, self._weight
         _predict(*how, before, after, sums, self.turn, *room)
 
     def examine(

@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from hil.offline import IMU_HEADER, NAV_HEADER, navigate, read_start, read_table, thin, write_table
+from hil.offline import IMU_HEADER, NAV_HEADER, navigate, read_init, thin
 from hil.scenario import load
+from hil.tables import read_table, write_table
 from hil.world.motion import Motion
 from nav.errors import HilError
 from nav.rotation import euler_from_quaternion
@@ -146,7 +147,9 @@ GOOD = "\n".join(f"{name} = {k}" for k, name in enumerate(NAV_HEADER))
 
 def test_start_is_read(tmp_path):
     (tmp_path / "init.toml").write_text(GOOD)
-    assert read_start(tmp_path / "init.toml") == {name: float(k) for k, name in enumerate(NAV_HEADER)}
+    start, believed = read_init(tmp_path / "init.toml")
+    assert believed is None
+    assert start == {name: float(k) for k, name in enumerate(NAV_HEADER)}
 
 
 @pytest.mark.parametrize(
@@ -164,7 +167,7 @@ def test_start_is_read(tmp_path):
 def test_bad_starts_name_the_key(tmp_path, text, say):
     (tmp_path / "init.toml").write_text(text)
     with pytest.raises(HilError) as refusal:
-        read_start(tmp_path / "init.toml")
+        read_init(tmp_path / "init.toml")
     assert say in str(refusal.value)
     assert "init.toml" in str(refusal.value)
 

@@ -223,6 +223,28 @@ def test_it_says_that_it_has_diverged_and_starts_again():
     assert wrong[0] == pytest.approx(1000.0, abs=5.0)
 
 
+def test_the_bias_of_the_alignment_is_kept():
+    """Through a measurement that was true before the first interval ended, and through a restart."""
+    bias, imu = np.radians([0.5, -0.4, 0.3]), record(MOTION_SMOOTH, 20.0)
+    imu.dtheta[:] += bias * STEP
+    rows = gnss_rows(MOTION_SMOOTH.truth(np.arange(1, 100) * 0.2 - 0.195), np.random.default_rng(8))
+    rows["value"][20:, 0] += north(1000.0)
+    found = AidedNavigator(Strapdown(), tuning(GRADES["dtg"], bias_removed=True), Settings(restart_s=5.0))
+    (truth,) = MOTION_SMOOTH.truth([0.0])
+    sigma = np.array([1.5, 1.5, 2.5, 0.05, 0.05, 0.08, 1e-3, 1e-3, 1e-3])
+    place = truth["lat"], truth["lon"], truth["height"]
+    found.start(0.0, *place, truth["vel_n"], truth["q_nb"], sigma, bias)
+    found.process(imu.rows(0, 100))
+    found.aid(rows)
+    found.process(imu.rows(100, 2000))
+    assert len(found.restarts()) == 1
+    assert np.abs(found.estimates[GYRO_BIAS] - bias).max() < 0.01 * np.abs(bias).min()
+    assert (
+        np.degrees(np.abs(attitude_error(found.solution[6:10], MOTION_SMOOTH.truth([found.time])["q_nb"][0]))).max()
+        < 0.1
+    )
+
+
 def test_a_board_at_rest_stays_where_it_is():
     """Zero velocity and zero rate alone: tilt to the accelerometers' bias over g, no drift of the heading beyond its sigma."""
     found = AidedNavigator(Strapdown(), tuning(GRADES["mems"], bias_removed=True))
