@@ -52,7 +52,7 @@ TICK_S = 0.02
 """Longest wait for a frame."""
 AIDING_FAULTS = ("lost", "duplicated", "crc_errors", "foreign", "short", "version_errors", "restarts")
 """Counters of aiding frames that the summary shows."""
-EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
+EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240"), ("station", "?")])
 """A message for the user, as it lies in the ring of events."""
 
 
@@ -294,7 +294,7 @@ class Loop:
             self._outlets.stats["silences"] += 1
         elif event == REALIGN:
             self._combiner.renew()
-            self.navigator.realign(self._last_time(), "ordered")
+            self.navigator.realign(float(self._last()["time"]), "ordered")
 
     def ordered_event(self) -> int:
         """An alignment that another process has ordered since the last look; 0 for none."""
@@ -304,9 +304,11 @@ class Loop:
         self._align_requests = requests
         return REALIGN
 
-    def _last_time(self) -> float:
+    def _last(self) -> Any:
+        """The newest solution; all zeros before the first."""
         row = np.zeros(1, NAV_STATE)
-        return float(row["time"][0]) if self._outlets.states.latest(row) else 0.0
+        self._outlets.states.latest(row)
+        return row[0]
 
     def _publish(self, rows: NDArray[Any]) -> None:
         outlets = self._outlets
@@ -315,11 +317,8 @@ class Loop:
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
             note = np.zeros(1, EVENTS)
-            note["time"], note["severity"], note["text"] = (
-                event.time,
-                event.severity.encode(),
-                event.text.encode()[:240],
-            )
+            note["time"], note["severity"], note["station"] = event.time, event.severity.encode(), event.station
+            note["text"] = event.text.encode()[:240]
             outlets.events.push(note)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
@@ -349,6 +348,10 @@ class Loop:
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
+        position, velocity, attitude = (float(np.linalg.norm(part)) for part in np.split(self._last()["sigma"], 3))
+        if math.isfinite(position + velocity + attitude) and self._samples:
+            sigma = {"position_m": position, "velocity_ms": velocity, "attitude_deg": math.degrees(attitude)}
+            result["estimate"] = {"sigma": sigma, "ratio": self._truth.ratios() if self._truth is not None else {}}
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
             if self._keep_trace:

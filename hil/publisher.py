@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -33,21 +34,37 @@ _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
 
 
-def run_publisher(
-    config: MavlinkConfig, ring: Ring, reader: int, control: Control, stop: Wake, report: Connection
-) -> None:
+@dataclass(frozen=True, slots=True)
+class Taps:
+    """What the publisher shares with the loop; picklable to a spawned process.
+
+    Attributes
+    ----------
+    states : Ring
+        Of `NAV_STATE`.
+    reader : int
+        Which of its wake-ups is ours.
+    events : Ring
+        Of `hil.bridge.EVENTS`: those for ground stations are told.
+    control : Control
+        Takes alignment requests to the loop; brings the loss of samples.
+    """
+
+    states: Ring
+    reader: int
+    events: Ring
+    control: Control
+
+
+def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
     """Publish until `stop` is called or the other end of `report` is closed; target of a spawned process.
 
     Parameters
     ----------
     config : MavlinkConfig
         Links, identity and rates.
-    ring : Ring
-        Of `NAV_STATE`.
-    reader : int
-        Which of the ring's wake-ups is ours.
-    control : Control
-        Takes alignment requests to the loop; brings the loss of samples.
+    taps : Taps
+        Shared with the loop.
     stop : Wake
         Ends the publisher.
     report : Connection
@@ -59,7 +76,7 @@ def run_publisher(
     with ExitStack() as stack:
         try:
             identity = Identity(config.system_id, config.component_id, config.vehicle)
-            station = Station(identity, config.rates_hz, undulation, lambda command: _obey(command, control))
+            station = Station(identity, config.rates_hz, undulation, lambda command: _obey(command, taps.control))
             endpoints = []
             for url in config.links:
                 link = open_link(url)
@@ -69,7 +86,7 @@ def run_publisher(
             _tell(report, {"failed": str(error)})
             return
         _warm_up(station)
-        publisher = _Publisher(ring, ring.wakes[reader], control, station, endpoints)
+        publisher = _Publisher(taps, station, endpoints)
         stack.callback(publisher.close)
         publisher.run(stop, report)
         _tell(report, publisher.counters())
@@ -78,12 +95,12 @@ def run_publisher(
 class _Publisher:
     """The state of one run."""
 
-    def __init__(
-        self, ring: Ring, wake: Wake, control: Control, station: Station, endpoints: Sequence[Endpoint]
-    ) -> None:
-        self._ring, self._wake, self._control = ring, wake, control
+    def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
+        self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
         self._station, self._endpoints = station, endpoints
         self._row = np.zeros(1, NAV_STATE)
+        self._events, self._event_number = taps.events, 0
+        self._notes = np.zeros(16, taps.events.dtype)
         self._seen = 0
         self._read_s = -math.inf
         self._silent = False
@@ -143,6 +160,10 @@ class _Publisher:
             self._silent = True
             self._station.silence()
         self._station.set_loss(self._control.lost, self._control.samples)
+        copied, first = self._events.pull(self._notes, self._event_number)
+        self._event_number = first + copied
+        for note in self._notes[:copied][self._notes["station"][:copied]]:
+            self._station.tell(note["severity"].decode(), note["text"].decode(errors="replace"))
 
     def _watch(self, wanted: bool) -> None:
         """Wait for the loop's call only while a new solution is wanted: it calls a thousand times a second."""

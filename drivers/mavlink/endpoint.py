@@ -6,7 +6,7 @@ says what time it is and is told when to come again.
 """
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,6 +27,10 @@ _ANNOUNCE_S = 0.5
 """Shortest time between two announcements of mode or health: a flapping flag may not fill the link."""
 _AGAIN_S = 0.5
 """When to look again at a link without a peer."""
+_NOTES = 16
+"""Most notes that wait to be told."""
+_TEXT = 50
+"""Characters of one STATUSTEXT."""
 _MARKERS = (mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2)
 
 _MODE_TEXT = {
@@ -44,6 +48,12 @@ _HEALTH_TEXT = {
     Health.RATE_TOO_SMALL: (mav.MAV_SEVERITY_WARNING, "Cannot find north: heading must be given"),
     Health.SPARE: (mav.MAV_SEVERITY_WARNING, "A redundant instrument has failed"),
     Health.UNAIDED: (mav.MAV_SEVERITY_NOTICE, "Position is not aided and drifts"),
+}
+_SEVERITIES = {
+    "info": mav.MAV_SEVERITY_INFO,
+    "notice": mav.MAV_SEVERITY_NOTICE,
+    "warning": mav.MAV_SEVERITY_WARNING,
+    "error": mav.MAV_SEVERITY_ERROR,
 }
 
 
@@ -97,6 +107,10 @@ class Station:
         self.solution = Solution.of(np.zeros(1, NAV_STATE)[0], geoid)
         self.number = 0
         """Counts solutions; 0 before the first one."""
+        self.notes: deque[tuple[int, str]] = deque(maxlen=_NOTES)
+        """The newest notes: severity and text."""
+        self.noted = 0
+        """Counts notes."""
         self.now_s = 0.0
         self._updated_s = 0.0
 
@@ -113,6 +127,11 @@ class Station:
         """No solution has come for too long: say so in status and text until the next one."""
         mode = Mode.DEGRADED if self.solution.mode == Mode.NAVIGATE else self.solution.mode
         self.solution = replace(self.solution, mode=mode, health=self.solution.health | Health.SILENT)
+
+    def tell(self, severity: str, text: str) -> None:
+        """Have something said on every link: ``"info"``, ``"notice"``, ``"warning"`` or ``"error"``."""
+        self.notes.append((int(_SEVERITIES[severity]), text))
+        self.noted += 1
 
     def set_loss(self, lost: int, samples: int) -> None:
         """Sensor samples lost and received since the start."""
@@ -191,6 +210,8 @@ class Endpoint:
         self._streams = {name: _Stream(kind, station.interval_s(name)) for name, kind in KINDS.items()}
         self._announced = (Mode.INIT, Health.GOOD)
         self._announce_s = -math.inf
+        self._told = station.noted
+        self._long_texts = 0
         station.on_rate.append(lambda name: self.set_interval(name, station.interval_s(name)))
 
     def poll(self, now_s: float) -> float:
@@ -200,7 +221,7 @@ class Endpoint:
         for message in self._parsed(data) if data else ():
             self._take(message)
         if not self.link.ready():
-            self.waits = False
+            self.waits, self._told = False, self.station.noted
             return now_s + _AGAIN_S
         self._announce(now_s)
         return self._send_due(now_s)
@@ -279,12 +300,23 @@ class Endpoint:
         answer(message, self)
 
     def _announce(self, now_s: float) -> None:
-        """STATUSTEXT of what has changed in mode and health since the last announcement."""
-        mode, health = self.station.solution.mode, self.station.solution.health
-        if (mode, health) == self._announced or now_s < self._announce_s:
+        """STATUSTEXT of what has changed in mode and health since the last announcement, or else of the next note."""
+        if now_s < self._announce_s:
             return
+        mode, health = self.station.solution.mode, self.station.solution.health
+        if (mode, health) != self._announced:
+            self._tell_change(mode, health)
+        elif self._told < self.station.noted:
+            notes, waiting = self.station.notes, min(self.station.noted - self._told, len(self.station.notes))
+            self._say(*notes[-waiting])
+            self._told = self.station.noted - waiting + 1
+        else:
+            return
+        self._announce_s = now_s + _ANNOUNCE_S
+
+    def _tell_change(self, mode: Mode, health: Health) -> None:
         old_mode, old_health = self._announced
-        self._announced, self._announce_s = (mode, health), now_s + _ANNOUNCE_S
+        self._announced = mode, health
         if mode != old_mode:
             severity = mav.MAV_SEVERITY_WARNING if mode == Mode.DEGRADED else mav.MAV_SEVERITY_INFO
             self._say(severity, _MODE_TEXT[mode])
@@ -295,4 +327,9 @@ class Endpoint:
                 self._say(mav.MAV_SEVERITY_INFO, f"Over: {text}")
 
     def _say(self, severity: int, text: str) -> None:
-        self.send(mav.MAVLink_statustext_message(severity, text.encode("ascii")))
+        """STATUSTEXT, of more than `_TEXT` characters in numbered pieces."""
+        data, number = text.encode("ascii", "replace"), 0
+        if len(data) > _TEXT:
+            self._long_texts = number = self._long_texts % 65535 + 1
+        for piece in range(0, max(len(data), 1), _TEXT):
+            self.send(mav.MAVLink_statustext_message(severity, data[piece : piece + _TEXT], number, piece // _TEXT))
