@@ -4,7 +4,8 @@
          \\-> aiding (to the navigator)                            \\-> frames ring (recorder)
 
 Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched: a measurement is taken
-between the samples between which it came. What the loop does on its own account (silence, an ordered alignment) goes into the
+between the samples between which it came. Measurements from the network come as frames too, in a ring of the publisher's,
+and are recorded like those of the bus. What the loop does on its own account (silence, an ordered alignment) goes into the
 recording as an event, so that a replay repeats it.
 """
 
@@ -88,6 +89,8 @@ class Outlets:
     states: Ring
     frames: Ring
     events: Ring
+    aiding: Ring
+    """Frames of measurements that the publisher has taken from the network."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
     recording: bool = False
@@ -98,7 +101,11 @@ class Outlets:
         from drivers.can.frames import FRAME
 
         return Outlets(
-            Ring(NAV_STATE, 8192, readers), Ring(FRAME, 1 << 16, 1), Ring(EVENTS, 256, 1), recording=recording
+            Ring(NAV_STATE, 8192, readers),
+            Ring(FRAME, 1 << 16, 1),
+            Ring(EVENTS, 256, 1),
+            Ring(FRAME, 1024, 0),
+            recording=recording,
         )
 
 
@@ -399,6 +406,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
     heard: int | None = None
     stats, control = outlets.stats, outlets.control
+    relayed, relayed_number = frames(BATCH), 0
     while not (control.stop or loop.finished or source.exhausted):
         n = source.receive(batch, wait)
         now = time.monotonic_ns()
@@ -413,6 +421,11 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             if got:
                 heard = now
                 stats["phase"] = Phase.RUNNING
+        if outlets.aiding.count > relayed_number:
+            copied, first = outlets.aiding.pull(relayed, relayed_number)
+            relayed_number = first + copied
+            _record(relayed[:copied], outlets, order.paced)
+            loop.take(relayed[:copied])
         event = loop.ordered_event()
         if source.live and heard is not None and now - heard > silence_ns:
             heard = None

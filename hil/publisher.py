@@ -12,12 +12,16 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from drivers.can.aiding import AidingEncoder
 from drivers.mavlink.endpoint import Endpoint, Identity, Station
+from drivers.mavlink.intake import Intake
 from drivers.mavlink.link import open_link
 from hil.control import Control
 from hil.geoid import undulation
@@ -48,12 +52,15 @@ class Taps:
         Of `hil.bridge.EVENTS`: those for ground stations are told.
     control : Control
         Takes alignment requests to the loop; brings the loss of samples.
+    aiding : Ring, optional
+        Of `FRAME`: takes measurements from the network to the loop.
     """
 
     states: Ring
     reader: int
     events: Ring
     control: Control
+    aiding: Ring | None = None
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -69,14 +76,17 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
         Ends the publisher.
     report : Connection
         Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
-        same for each URL) and ``latency_us`` (arrival of the sample to the end of sending, `None` without one); or
+        same for each URL), ``latency_us`` (arrival of the sample to the end of sending, `None` without one) and, where
+        measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
         ``failed``, a text, when a link could not be opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
         try:
             identity = Identity(config.system_id, config.component_id, config.vehicle)
-            station = Station(identity, config.rates_hz, undulation, lambda command: _obey(command, taps.control))
+            intake = _intake(config, taps.aiding)
+            order = partial(_obey, control=taps.control)
+            station = Station(identity, config.rates_hz, undulation, order, intake)
             endpoints = []
             for url in config.links:
                 link = open_link(url)
@@ -194,6 +204,8 @@ class _Publisher:
         }
         for key in ("bad_data", "dropped"):
             total[key] = sum(getattr(endpoint, key) for endpoint in self._endpoints)
+        if (intake := self._station.intake) is not None:
+            total["aiding"] = {"taken": dict(intake.taken), "refused": dict(intake.refused)}
         return total | {"links": links, "latency_us": self._latency()}
 
     def _latency(self) -> dict[str, float] | None:
@@ -202,6 +214,20 @@ class _Publisher:
             return None
         p50, p99, p999 = np.percentile(ages_us, (50.0, 99.0, 99.9))
         return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(ages_us.max())}
+
+
+def _intake(config: MavlinkConfig, ring: Ring | None) -> Intake | None:
+    """What is taken from the network, as frames of a sender of its own into `ring`."""
+    if ring is None or not config.aiding:
+        return None
+    encoder = AidingEncoder()
+
+    def relay(rows: NDArray[Any]) -> None:
+        batch = encoder.frames(rows)
+        batch["time_ns"] = time.time_ns()
+        ring.push(batch)
+
+    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay)
 
 
 def _obey(command: str, control: Control) -> None:

@@ -136,7 +136,8 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control)
+            live = self.order.paced and self.order.file is None
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, outlets.aiding if live else None)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:

@@ -24,6 +24,8 @@ PROTOCOL = 1
 """Version of the message set."""
 FIRST_ID, RESERVED_IDS = 0x150, 16
 """The identifiers that are reserved for aiding."""
+RELAYED = 128
+"""Sources from here on are not on the bus themselves: a relay sends for them, and counts its frames for itself."""
 _COMMON = ("crc16", "e2e_counter", "protocol", "source", "device_time")
 _TURN_US = 1 << 32
 
@@ -136,7 +138,7 @@ class AidingDecoder:
 
     def __init__(self) -> None:
         self._by_id = {message.codec.can_id: message for message in _messages().values()}
-        self._last: dict[Kind, int] = {}
+        self._last: dict[tuple[Kind, bool], int] = {}
         self.counters = Counters()
         """As for a board: `samples` are measurements, `restarts` counters that went back, `foreign` unused reserved ids."""
         self.heard = dict.fromkeys(_messages(), 0)
@@ -182,17 +184,22 @@ class AidingDecoder:
         ours = data[:, 3] == PROTOCOL
         self.counters.version_errors += int((good & ~ours).sum())
         good &= ours
-        numbers = data[good, 2].astype(np.int64)
-        if len(numbers) == 0:
-            return good
-        steps = np.diff(numbers, prepend=self._last.get(message.kind, numbers[0] - 1)) % 256
-        self._last[message.kind] = int(numbers[-1])
+        relayed = data[:, 4] >= RELAYED
+        for sender in np.unique(relayed[good]).tolist():
+            chosen = np.flatnonzero(good & (relayed == sender))
+            good[chosen] = self._counted((message.kind, sender), data[chosen, 2].astype(np.int64))
+        return good
+
+    def _counted(self, key: tuple[Kind, bool], numbers: IntArray) -> NDArray[np.bool_]:
+        """Which of the counters of one sender are new."""
+        steps = np.diff(numbers, prepend=self._last.get(key, numbers[0] - 1)) % 256
+        self._last[key] = int(numbers[-1])
         on = (steps > 0) & (steps < 128)
         self.counters.lost += int((steps[on] - 1).sum())
         self.counters.restarts += int((steps >= 128).sum())
         self.counters.duplicated += int((steps == 0).sum())
-        good[good] = steps > 0
-        return good
+        new: NDArray[np.bool_] = steps > 0
+        return new
 
 
 def _decoded(message: _Message, data: NDArray[np.uint8], now: float | None) -> AidingArray:

@@ -84,8 +84,12 @@ def _command_int(message: Any, endpoint: "Endpoint") -> None:
 
 
 def _command(message: Any, params: list[float], endpoint: "Endpoint") -> None:
-    handler = _COMMANDS.get(message.command)
-    result = mav.MAV_RESULT_UNSUPPORTED if handler is None else handler(params, endpoint)
+    handler, intake = _COMMANDS.get(message.command), endpoint.station.intake
+    result = mav.MAV_RESULT_UNSUPPORTED
+    if handler is not None:
+        result = handler(params, endpoint)
+    elif intake is not None:
+        result = intake.command(message, params, endpoint.station)
     endpoint.send(
         mav.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()

@@ -15,6 +15,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.commands import SHORTEST_INTERVAL_S, answer
+from drivers.mavlink.intake import Intake
 from drivers.mavlink.link import Link
 from drivers.mavlink.messages import KINDS, VEHICLES, Kind, Message, Situation
 from drivers.mavlink.parameters import Parameter, Parameters
@@ -79,6 +80,8 @@ class Station:
         (lat, lon), rad, to the height of the geoid above the ellipsoid, m.
     on_command : callable
         Called with the name of what a ground station wants done: ``"align"``.
+    intake : Intake, optional
+        Takes what aids the navigator; without it nothing does.
 
     Raises
     ------
@@ -87,7 +90,12 @@ class Station:
     """
 
     def __init__(
-        self, identity: Identity, rates_hz: Mapping[str, float], geoid: Undulation, on_command: Callable[[str], None]
+        self,
+        identity: Identity,
+        rates_hz: Mapping[str, float],
+        geoid: Undulation,
+        on_command: Callable[[str], None],
+        intake: Intake | None = None,
     ) -> None:
         if identity.vehicle not in VEHICLES:
             raise HilError(f"mavlink.vehicle = {identity.vehicle!r}: unknown; expected one of {', '.join(VEHICLES)}")
@@ -100,6 +108,7 @@ class Station:
         self.identity = identity
         self.geoid = geoid
         self.on_command = on_command
+        self.intake = intake
         self.on_rate: list[Callable[[str], None]] = []
         self._rates_hz = {name: kind.rate_hz for name, kind in KINDS.items()} | dict(rates_hz)
         self.parameters = Parameters(self._table())
@@ -297,6 +306,8 @@ class Endpoint:
         if (message.get_srcSystem(), message.get_srcComponent()) == (identity.system_id, identity.component_id):
             return  # our own, looped back
         self.received[message.get_type()] += 1
+        if self.station.intake is not None:
+            self.station.intake.message(message, self.station)
         answer(message, self)
 
     def _announce(self, now_s: float) -> None:

@@ -142,6 +142,22 @@ class Solution:
         return c * dz - s * outward, cl * dy - sl * dx, -(c * outward + s * dz)
 
 
+def geodetic(home: Home, ned: Vector) -> Vector:
+    """lat, lon (rad), height (m) of a point north, east, down of `home` in its local level, m; to micrometres within 100 km."""
+    s, c = math.sin(home.lat), math.cos(home.lat)
+    outward = -s * ned[0] - c * ned[2]
+    sl, cl = math.sin(home.lon), math.cos(home.lon)
+    offset = cl * outward - sl * ned[1], sl * outward + cl * ned[1], c * ned[0] - s * ned[2]
+    x, y, z = (a + b for a, b in zip(_ecef_of(home), offset, strict=True))
+    level, lat, height = math.hypot(x, y), home.lat, home.height
+    for _ in range(5):
+        prime = A / math.sqrt(1.0 - E2 * math.sin(lat) ** 2)
+        lat = math.atan2(z, level * (1.0 - E2 * prime / (prime + height)))
+        s, c = math.sin(lat), math.cos(lat)
+        height = level * c + z * s - A * math.sqrt(1.0 - E2 * s * s)
+    return lat, math.atan2(y, x), height
+
+
 def _usable(*values: float) -> bool:
     return all(abs(value) < _LARGEST for value in values)  # False for NaN too
 
