@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.can.aiding import AidingEncoder
-from drivers.mavlink.endpoint import Endpoint, Identity, Station
+from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.intake import Intake
 from drivers.mavlink.link import open_link
+from drivers.mavlink.station import Identity, Station
 from hil.control import Control
 from hil.geoid import undulation
 from hil.ring import Ring, Wake

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.can.aiding import RELAYED
+from drivers.mavlink.messages import DIAGONAL
 from drivers.mavlink.solution import Home, Undulation, geodetic
 from nav.aiding import Kind, aiding
 from nav.errors import HilError
@@ -33,8 +34,6 @@ RECEIVERS = 16
 VISION, MASTER, OPERATOR = RELAYED + RECEIVERS, RELAYED + RECEIVERS + 1, RELAYED + RECEIVERS + 2
 """Sources of rows: a receiver is `RELAYED` + its number, below `RECEIVERS`."""
 
-_DIAGONAL = (0, 6, 11, 15, 18, 20)
-"""Places of the diagonal in the upper triangle of a 6 x 6 matrix, row by row."""
 _FIXES = (
     mav.GPS_FIX_TYPE_2D_FIX,
     mav.GPS_FIX_TYPE_3D_FIX,
@@ -192,7 +191,7 @@ def _degrees_e7(lat: int, lon: int) -> tuple[float, float]:
 
 def _sigmas(covariance: Sequence[float], smallest_m: float, smallest_rad: float) -> tuple[float, ...]:
     """One sigma of each of six; infinite where a variance is not there: NaN, zero, or a NaN in the first place."""
-    variances = [covariance[place] if not math.isnan(covariance[0]) else math.nan for place in _DIAGONAL]
+    variances = [covariance[place] if not math.isnan(covariance[0]) else math.nan for place in DIAGONAL]
     smallest = (smallest_m,) * 3 + (smallest_rad,) * 3
     return tuple(
         max(math.sqrt(v), least) if v > 0.0 else math.inf for v, least in zip(variances, smallest, strict=True)

@@ -21,7 +21,7 @@ from nav.errors import HilError
 from nav.state import Health, Mode
 
 if TYPE_CHECKING:
-    from drivers.mavlink.endpoint import Station
+    from drivers.mavlink.station import Station
 
 SHORTEST_S = 0.01
 """Between two messages of one kind of one sender: a flood may not hold the navigator up."""

@@ -39,6 +39,8 @@ _ACCEL = mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
 _AHRS = mav.MAV_SYS_STATUS_AHRS
 _ACCEL_AND_GYRO_UPDATED = 0b111111
 
+DIAGONAL = (0, 6, 11, 15, 18, 20)
+"""Places of the diagonal in the upper triangle of a 6 x 6 matrix, row by row."""
 GOOD_POSITION_M, GOOD_VELOCITY_MS, GOOD_ATTITUDE = 10.0, 1.0, math.radians(5.0)
 """An estimate is called good up to this sigma (horizontal: of north and east together)."""
 
@@ -201,9 +203,9 @@ def odometry(solution: Solution, situation: Situation) -> Message | None:
         return None
     pose, velocity = [math.nan] * 21, [math.nan] * 21
     if solution.has_sigma:
-        for place, variance in zip(_DIAGONAL, (s * s for s in solution.sigma[:3] + solution.sigma[6:]), strict=True):
+        for place, variance in zip(DIAGONAL, (s * s for s in solution.sigma[:3] + solution.sigma[6:]), strict=True):
             pose[place] = variance
-        for place, variance in zip(_DIAGONAL[:3], solution.vel_b_variance, strict=True):
+        for place, variance in zip(DIAGONAL[:3], solution.vel_b_variance, strict=True):
             velocity[place] = variance
     return mav.MAVLink_odometry_message(
         _boot_us(solution), mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_FRD, *solution.relative_to(situation.home),
@@ -265,10 +267,6 @@ KINDS = {
     "HEARTBEAT": Kind(heartbeat, 1.0, "SR_BEAT_HZ", from_solution=False),
 }
 """Every message that is sent at a rate, most urgent first."""
-
-
-_DIAGONAL = (0, 6, 11, 15, 18, 20)
-"""Places of the diagonal in the upper triangle of a 6 x 6 matrix, row by row."""
 
 
 def _estimate_flags(solution: Solution) -> int:

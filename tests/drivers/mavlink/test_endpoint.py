@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.commands import MESSAGE_NAMES
-from drivers.mavlink.endpoint import Endpoint, Identity, Station
+from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.link import StreamLink, UdpLink, open_link
 from drivers.mavlink.messages import KINDS
+from drivers.mavlink.station import Identity, Station
 from nav.errors import HilError
 from nav.state import NAV_STATE, Health, Mode
 

@@ -8,8 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.can.aiding import AidingEncoder
-from drivers.mavlink.endpoint import Identity, Station
 from drivers.mavlink.intake import Intake
+from drivers.mavlink.station import Identity, Station
 from nav.aiding import Kind
 from nav.state import NAV_STATE, Health, Mode
 
