@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.can.aiding import AidingEncoder
 from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.intake import Intake
 from drivers.mavlink.link import open_link
@@ -221,6 +220,8 @@ def _intake(config: MavlinkConfig, ring: Ring | None) -> Intake | None:
     """What is taken from the network, as frames of a sender of its own into `ring`."""
     if ring is None or not config.aiding:
         return None
+    from drivers.can.aiding import AidingEncoder
+
     encoder = AidingEncoder()
 
     def relay(rows: NDArray[Any]) -> None:

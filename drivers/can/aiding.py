@@ -1,8 +1,8 @@
 """Measurements that aid the navigator, on CAN FD: rows of `AIDING` to frames of `fixtures/can/aiding.dbc` and back.
 
-One frame a measurement, AUTOSAR E2E as for the head. A standard deviation of 0 on the wire is an infinite one: the value is
-not there. The frames carry 32 bits of the inertial sensor's clock in us; they are unwrapped next to the newest time of
-that sensor. A classic bus cannot carry them.
+One frame a measurement, AUTOSAR E2E as for the head; a relay (:data:`nav.aiding.RELAYED`) counts its frames for itself. A
+standard deviation of 0 on the wire is an infinite one: the value is not there. The frames carry 32 bits of the inertial
+sensor's clock in us; they are unwrapped next to the newest time of that sensor. A classic bus cannot carry them.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from drivers import Counters
 from drivers.can.codec import MessageCodec, load_database
 from drivers.can.frames import BRS, FDF, FrameArray, frames
 from drivers.can.integrity import Protection, protection
-from nav.aiding import AIDING, Kind
+from nav.aiding import AIDING, RELAYED, Kind
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 
@@ -24,8 +24,6 @@ PROTOCOL = 1
 """Version of the message set."""
 FIRST_ID, RESERVED_IDS = 0x150, 16
 """The identifiers that are reserved for aiding."""
-RELAYED = 128
-"""Sources from here on are not on the bus themselves: a relay sends for them, and counts its frames for itself."""
 _COMMON = ("crc16", "e2e_counter", "protocol", "source", "device_time")
 _TURN_US = 1 << 32
 

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from drivers.can.aiding import RELAYED
 from drivers.mavlink.messages import DIAGONAL
 from drivers.mavlink.solution import Home, Undulation, geodetic
-from nav.aiding import Kind, aiding
+from nav.aiding import RELAYED, Kind, aiding
 from nav.errors import HilError
 from nav.rotation import quaternion_from_euler
 

@@ -8,13 +8,13 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from drivers.can.aiding import RELAYED, AidingDecoder, AidingEncoder
+from drivers.can.aiding import AidingDecoder, AidingEncoder
 from drivers.can.frames import FrameArray
 from hil.bridge import LoopOrder
 from hil.pytest_plugin import StartBridge
 from hil.scenario import Scenario
 from hil.session import Session
-from nav.aiding import Kind, aiding_rows
+from nav.aiding import RELAYED, Kind, aiding_rows
 from nav.earth import curvature_radii
 from nav.errors import HilError
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from scipy.spatial.transform import Rotation
 
-from drivers.can.aiding import RELAYED, AidingDecoder, AidingEncoder
+from drivers.can.aiding import AidingDecoder, AidingEncoder
 from drivers.mavlink.aiding import (
     FROM_ANYONE,
     FROM_MASTER,
@@ -24,7 +24,7 @@ from drivers.mavlink.aiding import (
     operator_position,
 )
 from drivers.mavlink.solution import Home, geodetic
-from nav.aiding import Kind
+from nav.aiding import RELAYED, Kind
 
 GEOID_M = 25.0
 HOME = Home(math.radians(50.0), math.radians(36.25), 150.0)
