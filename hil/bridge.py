@@ -4,7 +4,8 @@
          \\-> aiding (to the navigator)                            \\-> frames ring (recorder)
 
 Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched: a measurement is taken
-between the samples between which it came. What the loop does on its own account (silence, an ordered alignment) goes into the
+between the samples between which it came. Measurements from the network come as frames too, in a ring of the publisher's,
+and are recorded like those of the bus. What the loop does on its own account (silence, an ordered alignment) goes into the
 recording as an event, so that a replay repeats it.
 """
 
@@ -56,7 +57,7 @@ AIDING_FAULTS = ("lost", "duplicated", "crc_errors", "foreign", "short", "versio
 """Counters of aiding frames that the summary shows."""
 BAROMETER_M = 1000.0
 """How far a pressure height may be from the ellipsoid at first, one sigma: it is that above some field, on some day."""
-EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240")])
+EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240"), ("station", "?")])
 """A message for the user, as it lies in the ring of events."""
 
 
@@ -92,6 +93,8 @@ class Outlets:
     states: Ring
     frames: Ring
     events: Ring
+    aiding: Ring
+    """Frames of measurements that the publisher has taken from the network."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
     recording: bool = False
@@ -102,7 +105,11 @@ class Outlets:
         from drivers.can.frames import FRAME
 
         return Outlets(
-            Ring(NAV_STATE, 8192, readers), Ring(FRAME, 1 << 16, 1), Ring(EVENTS, 256, 1), recording=recording
+            Ring(NAV_STATE, 8192, readers),
+            Ring(FRAME, 1 << 16, 1),
+            Ring(EVENTS, 256, 1),
+            Ring(FRAME, 1024, 0),
+            recording=recording,
         )
 
 
@@ -329,7 +336,7 @@ class Loop:
             self._outlets.stats["silences"] += 1
         elif event == REALIGN:
             self._combiner.renew()
-            self.navigator.realign(self._last_time(), "ordered")
+            self.navigator.realign(float(self._last()["time"]), "ordered")
 
     def ordered_event(self) -> int:
         """An alignment that another process has ordered since the last look; 0 for none."""
@@ -339,9 +346,11 @@ class Loop:
         self._align_requests = requests
         return REALIGN
 
-    def _last_time(self) -> float:
+    def _last(self) -> Any:
+        """The newest solution; all zeros before the first."""
         row = np.zeros(1, NAV_STATE)
-        return float(row["time"][0]) if self._outlets.states.latest(row) else 0.0
+        self._outlets.states.latest(row)
+        return row[0]
 
     def _publish(self, rows: NDArray[Any]) -> None:
         outlets = self._outlets
@@ -350,11 +359,8 @@ class Loop:
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
             note = np.zeros(1, EVENTS)
-            note["time"], note["severity"], note["text"] = (
-                event.time,
-                event.severity.encode(),
-                event.text.encode()[:240],
-            )
+            note["time"], note["severity"], note["station"] = event.time, event.severity.encode(), event.station
+            note["text"] = event.text.encode()[:240]
             outlets.events.push(note)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
@@ -386,6 +392,10 @@ class Loop:
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
+        position, velocity, attitude = (float(np.linalg.norm(part)) for part in np.split(self._last()["sigma"], 3))
+        if math.isfinite(position + velocity + attitude) and self._samples:
+            sigma = {"position_m": position, "velocity_ms": velocity, "attitude_deg": math.degrees(attitude)}
+            result["estimate"] = {"sigma": sigma, "ratio": self._truth.ratios() if self._truth is not None else {}}
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
             if self._keep_trace:
@@ -433,6 +443,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
     heard: int | None = None
     stats, control = outlets.stats, outlets.control
+    relayed, relayed_number = frames(BATCH), 0
     while not (control.stop or loop.finished or source.exhausted):
         n = source.receive(batch, wait)
         now = time.monotonic_ns()
@@ -447,6 +458,11 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             if got:
                 heard = now
                 stats["phase"] = Phase.RUNNING
+        if outlets.aiding.count > relayed_number:
+            copied, first = outlets.aiding.pull(relayed, relayed_number)
+            relayed_number = first + copied
+            _record(relayed[:copied], outlets, order.paced)
+            loop.take(relayed[:copied])
         event = loop.ordered_event()
         if source.live and heard is not None and now - heard > silence_ns:
             heard = None

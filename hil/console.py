@@ -127,6 +127,10 @@ def print_summary(summary: dict[str, Any]) -> None:
         ("MAVLink messages sent", str(sum(summary["mavlink_sent"].values()))),
     ):
         table.add_row(name, value)
+    if "estimate" in summary:
+        sigma = summary["estimate"]["sigma"]
+        own = f"{sigma['position_m']:.3g} m, {sigma['velocity_ms']:.3g} m/s, {sigma['attitude_deg']:.3g} deg"
+        table.add_row("own sigma at the end", own)
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")

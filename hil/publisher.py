@@ -11,13 +11,18 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.mavlink.endpoint import Endpoint, Identity, Station
+from drivers.mavlink.endpoint import Endpoint
+from drivers.mavlink.intake import Intake
 from drivers.mavlink.link import open_link
+from drivers.mavlink.station import Identity, Station
 from hil.control import Control
 from hil.geoid import undulation
 from hil.ring import Ring, Wake
@@ -33,33 +38,55 @@ _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
 
 
-def run_publisher(
-    config: MavlinkConfig, ring: Ring, reader: int, control: Control, stop: Wake, report: Connection
-) -> None:
+@dataclass(frozen=True, slots=True)
+class Taps:
+    """What the publisher shares with the loop; picklable to a spawned process.
+
+    Attributes
+    ----------
+    states : Ring
+        Of `NAV_STATE`.
+    reader : int
+        Which of its wake-ups is ours.
+    events : Ring
+        Of `hil.bridge.EVENTS`: those for ground stations are told.
+    control : Control
+        Takes alignment requests to the loop; brings the loss of samples.
+    aiding : Ring, optional
+        Of `FRAME`: takes measurements from the network to the loop.
+    """
+
+    states: Ring
+    reader: int
+    events: Ring
+    control: Control
+    aiding: Ring | None = None
+
+
+def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
     """Publish until `stop` is called or the other end of `report` is closed; target of a spawned process.
 
     Parameters
     ----------
     config : MavlinkConfig
         Links, identity and rates.
-    ring : Ring
-        Of `NAV_STATE`.
-    reader : int
-        Which of the ring's wake-ups is ours.
-    control : Control
-        Takes alignment requests to the loop; brings the loss of samples.
+    taps : Taps
+        Shared with the loop.
     stop : Wake
         Ends the publisher.
     report : Connection
         Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
-        same for each URL) and ``latency_us`` (arrival of the sample to the end of sending, `None` without one); or
+        same for each URL), ``latency_us`` (arrival of the sample to the end of sending, `None` without one) and, where
+        measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
         ``failed``, a text, when a link could not be opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
         try:
             identity = Identity(config.system_id, config.component_id, config.vehicle)
-            station = Station(identity, config.rates_hz, undulation, lambda command: _obey(command, control))
+            intake = _intake(config, taps.aiding)
+            order = partial(_obey, control=taps.control)
+            station = Station(identity, config.rates_hz, undulation, order, intake)
             endpoints = []
             for url in config.links:
                 link = open_link(url)
@@ -69,7 +96,7 @@ def run_publisher(
             _tell(report, {"failed": str(error)})
             return
         _warm_up(station)
-        publisher = _Publisher(ring, ring.wakes[reader], control, station, endpoints)
+        publisher = _Publisher(taps, station, endpoints)
         stack.callback(publisher.close)
         publisher.run(stop, report)
         _tell(report, publisher.counters())
@@ -78,12 +105,12 @@ def run_publisher(
 class _Publisher:
     """The state of one run."""
 
-    def __init__(
-        self, ring: Ring, wake: Wake, control: Control, station: Station, endpoints: Sequence[Endpoint]
-    ) -> None:
-        self._ring, self._wake, self._control = ring, wake, control
+    def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
+        self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
         self._station, self._endpoints = station, endpoints
         self._row = np.zeros(1, NAV_STATE)
+        self._events, self._event_number = taps.events, 0
+        self._notes = np.zeros(16, taps.events.dtype)
         self._seen = 0
         self._read_s = -math.inf
         self._silent = False
@@ -143,6 +170,10 @@ class _Publisher:
             self._silent = True
             self._station.silence()
         self._station.set_loss(self._control.lost, self._control.samples)
+        copied, first = self._events.pull(self._notes, self._event_number)
+        self._event_number = first + copied
+        for note in self._notes[:copied][self._notes["station"][:copied]]:
+            self._station.tell(note["severity"].decode(), note["text"].decode(errors="replace"))
 
     def _watch(self, wanted: bool) -> None:
         """Wait for the loop's call only while a new solution is wanted: it calls a thousand times a second."""
@@ -173,6 +204,8 @@ class _Publisher:
         }
         for key in ("bad_data", "dropped"):
             total[key] = sum(getattr(endpoint, key) for endpoint in self._endpoints)
+        if (intake := self._station.intake) is not None:
+            total["aiding"] = {"taken": dict(intake.taken), "refused": dict(intake.refused)}
         return total | {"links": links, "latency_us": self._latency()}
 
     def _latency(self) -> dict[str, float] | None:
@@ -181,6 +214,22 @@ class _Publisher:
             return None
         p50, p99, p999 = np.percentile(ages_us, (50.0, 99.0, 99.9))
         return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(ages_us.max())}
+
+
+def _intake(config: MavlinkConfig, ring: Ring | None) -> Intake | None:
+    """What is taken from the network, as frames of a sender of its own into `ring`."""
+    if ring is None or not config.aiding:
+        return None
+    from drivers.can.aiding import AidingEncoder
+
+    encoder = AidingEncoder()
+
+    def relay(rows: NDArray[Any]) -> None:
+        batch = encoder.frames(rows)
+        batch["time_ns"] = time.time_ns()
+        ring.push(batch)
+
+    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay)
 
 
 def _obey(command: str, control: Control) -> None:

@@ -313,6 +313,14 @@ class MavlinkConfig(_Model):
     vehicle: Literal["fixed-wing", "quadrotor", "helicopter", "ground-rover", "surface-boat", "generic"] = "fixed-wing"
     rates_hz: Mapping[str, NotNegative] = Field(default_factory=dict)
     """Message name to rate, over the built-in rates; 0 switches a message off."""
+    aiding: bool = False
+    """Take measurements from the network."""
+    aiding_from: tuple[Annotated[int, Field(ge=1, le=255)], ...] = (255,)
+    """Systems that may send them."""
+    aiding_delay_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """How old they are when they come."""
+    master: tuple[Annotated[int, Field(ge=1, le=255)], Annotated[int, Field(ge=1, le=255)]] | None = None
+    """System and component of another inertial system, whose position, velocity and attitude are taken."""
 
 
 class Scenario(_Model):
@@ -336,6 +344,10 @@ class Scenario(_Model):
         aiding = self.aiding
         if self.head.layout == "classic" and (aiding.gnss or aiding.baro or aiding.magnetometer or aiding.heading):
             raise ValueError('simulated aiding needs CAN FD: head.layout = "fd"')
+        if self.mavlink.aiding and not self.navigation.aided:
+            raise ValueError("mavlink.aiding needs a navigator that takes measurements: navigation.aided = true")
+        if self.mavlink.master is not None and not self.mavlink.aiding:
+            raise ValueError("mavlink.master is followed with mavlink.aiding = true only")
         return self
 
     def with_changes(self, **changes: Any) -> "Scenario":

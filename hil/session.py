@@ -20,7 +20,7 @@ import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.control import run_part
-from hil.publisher import run_publisher
+from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
 from hil.stats import Phase
@@ -136,9 +136,9 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            launch(
-                "publisher", run_publisher, scenario.mavlink, outlets.states, 0, outlets.control, self._publisher_stop
-            )
+            live = self.order.paced and self.order.file is None
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, outlets.aiding if live else None)
+            launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""

@@ -9,6 +9,9 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+RELAYED = 128
+"""Sources from here on to 255 are those of another network, for which a relay sends."""
+
 
 class Kind(IntEnum):
     """What a row measures: its values, and the axes and units of their standard deviations."""

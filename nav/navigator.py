@@ -19,6 +19,7 @@ from nav.filter.aided import AidedNavigator
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.record import Recorder
 from nav.filter.states import GYRO_BIAS, Tuning
+from nav.filter.watch import Watch
 from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, Validity
@@ -107,6 +108,8 @@ class Event:
     time: float
     severity: Severity
     text: str
+    station: bool = False
+    """Ground stations are told too: they cannot see it from mode and health."""
 
 
 class Navigator:
@@ -122,6 +125,7 @@ class Navigator:
         self._core = Strapdown(settings.attitude, settings.mechanization, settings.gravity)
         aiding = settings.aiding
         self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter, recorder)
+        self._watch = None if self._aided is None else Watch(self._aided)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -189,7 +193,8 @@ class Navigator:
         if self._aided is not None and self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
             self._aided.aid(rows)
             for restart in self._aided.restarts():
-                self.tell(restart.time, "warning", "the filter had diverged: it starts again where GNSS says")
+                text = "the filter had diverged: it starts again where GNSS says"
+                self.tell(restart.time, "warning", text, station=True)
 
     def silent(self) -> StateArray:
         """The sensor has fallen silent: one row that repeats the last state and says so."""
@@ -258,6 +263,8 @@ class Navigator:
         sigma = self.settings.aiding.sigma.copy()
         sigma[6:9] = np.maximum(sigma[6:9], [sigma_tilt, sigma_tilt, sigma_heading])
         self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma, self.gyro_bias)
+        if self._watch is not None:
+            self._watch.start()
 
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):
@@ -330,6 +337,10 @@ class Navigator:
 
     def _navigate(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
         event = 0
+        if self._watch is not None:
+            stop = start + self._watch.part(imu.time[start:stop])
+            for note in self._watch.notes():
+                self.tell(note.time, "warning" if note.bad else "notice", note.text, station=True)
         if self.settings.track_bias_at_rest:
             used, event = rest.accumulate(
                 self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], REST_WINDOW_S
@@ -364,6 +375,7 @@ class Navigator:
         part["lat"], part["lon"], part["height"] = position[:, 0], position[:, 1], position[:, 2]
         part["vel_n"], part["q_nb"], part["gyro_bias"] = velocity, attitude, self.gyro_bias
         part["progress"] = 1.0
+        self._fill_worth(part)
         if event == 2:
             self._track_bias()
         return n
@@ -409,14 +421,20 @@ class Navigator:
             self.health |= health
             self.tell(time, "warning", text)
 
-    def tell(self, time: float, severity: Severity, text: str) -> None:
-        self._events.append(Event(time, severity, text))
+    def tell(self, time: float, severity: Severity, text: str, *, station: bool = False) -> None:
+        self._events.append(Event(time, severity, text, station))
 
     def _fill_constant(self, part: StateArray) -> None:
         part["mode"], part["health"] = self.mode, self.health
         part["lat"], part["lon"], part["height"] = self._state[0], self._state[1], self._state[2]
         part["vel_n"], part["q_nb"], part["gyro_bias"] = self._state[3:6], self._state[6:10], self.gyro_bias
         part["progress"] = self._progress
+        self._fill_worth(part)
+
+    def _fill_worth(self, part: StateArray) -> None:
+        part["sigma"], part["test_ratio"] = np.inf, 0.0
+        if self._watch is not None and self.mode >= Mode.NAVIGATE:
+            part["sigma"], part["test_ratio"] = self._watch.sigma, self._watch.ratio
 
 
 def _solution(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> FloatArray:

@@ -40,6 +40,19 @@ class Health(IntFlag):
     """A redundant instrument has failed: the solution is good, but there is none to spare."""
 
 
+class Ratio(IntEnum):
+    """Places of what `test_ratio` holds."""
+
+    VELOCITY = 0
+    POSITION = 1
+    HEIGHT = 2
+    """Of a barometer."""
+    DIRECTION = 3
+    """Heading, attitude, magnetic field."""
+    REST = 4
+    """Of a vehicle that is known to stand."""
+
+
 NAV_STATE = np.dtype(
     [
         ("arrival_ns", "<i8"),  # host clock (UTC, ns) when the sample's last frame was sent or received
@@ -57,9 +70,22 @@ NAV_STATE = np.dtype(
         ("f_b", "<f8", 3),  # mean over the sample's step, m/s^2
         ("gyro_bias", "<f8", 3),  # rad/s
         ("progress", "<f8"),  # of the alignment, 0..1
+        (
+            "sigma",
+            "<f4",
+            9,
+        ),  # one sigma of position, velocity, attitude, each north, east, down: m, m/s, rad; inf: unknown
+        (
+            "test_ratio",
+            "<f4",
+            len(Ratio),
+        ),  # innovation over its gate, by `Ratio`; 1 and more: rejected, 0: no measurement
     ]
 )
-"""One solution. Until the mode is NAVIGATE or DEGRADED, position is the configured start and velocity is zero."""
+"""One solution. Until the mode is NAVIGATE or DEGRADED, position is the configured start and velocity is zero.
+
+Only an aided navigator knows its sigmas: they are infinite, and the ratios zero, in all others and until the mode is NAVIGATE.
+"""
 
 HOST_FIELDS = 16
 """Bytes at the start of a row that belong to the host's clock; all that follows is the same in every replay."""

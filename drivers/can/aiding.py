@@ -1,8 +1,8 @@
 """Measurements that aid the navigator, on CAN FD: rows of `AIDING` to frames of `fixtures/can/aiding.dbc` and back.
 
-One frame a measurement, AUTOSAR E2E as for the head. A standard deviation of 0 on the wire is an infinite one: the value is
-not there. The frames carry 32 bits of the inertial sensor's clock in us; they are unwrapped next to the newest time of
-that sensor. A classic bus cannot carry them.
+One frame a measurement, AUTOSAR E2E as for the head; a relay (:data:`nav.aiding.RELAYED`) counts its frames for itself. A
+standard deviation of 0 on the wire is an infinite one: the value is not there. The frames carry 32 bits of the inertial
+sensor's clock in us; they are unwrapped next to the newest time of that sensor. A classic bus cannot carry them.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from drivers import Counters
 from drivers.can.codec import MessageCodec, load_database
 from drivers.can.frames import BRS, FDF, FrameArray, frames
 from drivers.can.integrity import Protection, protection
-from nav.aiding import AIDING, Kind
+from nav.aiding import AIDING, RELAYED, Kind
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 
@@ -136,7 +136,7 @@ class AidingDecoder:
 
     def __init__(self) -> None:
         self._by_id = {message.codec.can_id: message for message in _messages().values()}
-        self._last: dict[Kind, int] = {}
+        self._last: dict[tuple[Kind, bool], int] = {}
         self.counters = Counters()
         """As for a board: `samples` are measurements, `restarts` counters that went back, `foreign` unused reserved ids."""
         self.heard = dict.fromkeys(_messages(), 0)
@@ -182,17 +182,22 @@ class AidingDecoder:
         ours = data[:, 3] == PROTOCOL
         self.counters.version_errors += int((good & ~ours).sum())
         good &= ours
-        numbers = data[good, 2].astype(np.int64)
-        if len(numbers) == 0:
-            return good
-        steps = np.diff(numbers, prepend=self._last.get(message.kind, numbers[0] - 1)) % 256
-        self._last[message.kind] = int(numbers[-1])
+        relayed = data[:, 4] >= RELAYED
+        for sender in np.unique(relayed[good]).tolist():
+            chosen = np.flatnonzero(good & (relayed == sender))
+            good[chosen] = self._counted((message.kind, sender), data[chosen, 2].astype(np.int64))
+        return good
+
+    def _counted(self, key: tuple[Kind, bool], numbers: IntArray) -> NDArray[np.bool_]:
+        """Which of the counters of one sender are new."""
+        steps = np.diff(numbers, prepend=self._last.get(key, numbers[0] - 1)) % 256
+        self._last[key] = int(numbers[-1])
         on = (steps > 0) & (steps < 128)
         self.counters.lost += int((steps[on] - 1).sum())
         self.counters.restarts += int((steps >= 128).sum())
         self.counters.duplicated += int((steps == 0).sum())
-        good[good] = steps > 0
-        return good
+        new: NDArray[np.bool_] = steps > 0
+        return new
 
 
 def _decoded(message: _Message, data: NDArray[np.uint8], now: float | None) -> AidingArray:

@@ -25,11 +25,11 @@ LONGEST_HEARTBEAT_S = 2.0
 
 _STREAMS = {
     mav.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU",),
-    mav.MAV_DATA_STREAM_EXTENDED_STATUS: ("SYS_STATUS", "GPS_RAW_INT"),
+    mav.MAV_DATA_STREAM_EXTENDED_STATUS: ("SYS_STATUS", "GPS_RAW_INT", "ESTIMATOR_STATUS"),
     mav.MAV_DATA_STREAM_POSITION: ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
     mav.MAV_DATA_STREAM_EXTRA1: ("ATTITUDE", "ATTITUDE_QUATERNION"),
     mav.MAV_DATA_STREAM_EXTRA2: ("VFR_HUD",),
-    mav.MAV_DATA_STREAM_EXTRA3: ("ALTITUDE", "SYSTEM_TIME"),
+    mav.MAV_DATA_STREAM_EXTRA3: ("ALTITUDE", "SYSTEM_TIME", "ODOMETRY", "EKF_STATUS_REPORT"),
 }
 _STREAMS[mav.MAV_DATA_STREAM_ALL] = tuple(name for names in _STREAMS.values() for name in names)
 
@@ -84,8 +84,12 @@ def _command_int(message: Any, endpoint: "Endpoint") -> None:
 
 
 def _command(message: Any, params: list[float], endpoint: "Endpoint") -> None:
-    handler = _COMMANDS.get(message.command)
-    result = mav.MAV_RESULT_UNSUPPORTED if handler is None else handler(params, endpoint)
+    handler, intake = _COMMANDS.get(message.command), endpoint.station.intake
+    result = mav.MAV_RESULT_UNSUPPORTED
+    if handler is not None:
+        result = handler(params, endpoint)
+    elif intake is not None:
+        result = intake.command(message, params, endpoint.station)
     endpoint.send(
         mav.MAVLink_command_ack_message(
             message.command, result, 0, 0, message.get_srcSystem(), message.get_srcComponent()

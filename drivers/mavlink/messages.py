@@ -13,7 +13,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.solution import Home, Solution
-from nav.state import Health, Mode
+from nav.state import Health, Mode, Ratio
 
 Message = Any
 """A message of pymavlink, which has no type information."""
@@ -38,6 +38,11 @@ _GYRO = mav.MAV_SYS_STATUS_SENSOR_3D_GYRO
 _ACCEL = mav.MAV_SYS_STATUS_SENSOR_3D_ACCEL
 _AHRS = mav.MAV_SYS_STATUS_AHRS
 _ACCEL_AND_GYRO_UPDATED = 0b111111
+
+DIAGONAL = (0, 6, 11, 15, 18, 20)
+"""Places of the diagonal in the upper triangle of a 6 x 6 matrix, row by row."""
+GOOD_POSITION_M, GOOD_VELOCITY_MS, GOOD_ATTITUDE = 10.0, 1.0, math.radians(5.0)
+"""An estimate is called good up to this sigma (horizontal: of north and east together)."""
 
 
 @dataclass(frozen=True)
@@ -188,6 +193,50 @@ def gps_raw_int(solution: Solution, _: Situation) -> Message | None:
     )
 
 
+def odometry(solution: Solution, situation: Situation) -> Message | None:
+    """ODOMETRY: position relative to home, velocity in body axes.
+
+    Covariances are diagonal: elements that are not known are NaN, all of them when nothing is. Errors of the attitude are about
+    north, east and down.
+    """
+    if not solution.has_position or situation.home is None:
+        return None
+    pose, velocity = [math.nan] * 21, [math.nan] * 21
+    if solution.has_sigma:
+        for place, variance in zip(DIAGONAL, (s * s for s in solution.sigma[:3] + solution.sigma[6:]), strict=True):
+            pose[place] = variance
+        for place, variance in zip(DIAGONAL[:3], solution.vel_b_variance, strict=True):
+            velocity[place] = variance
+    return mav.MAVLink_odometry_message(
+        _boot_us(solution), mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_FRD, *solution.relative_to(situation.home),
+        solution.q_nb, *solution.vel_b, *solution.w_nb_b, pose, velocity, 0, mav.MAV_ESTIMATOR_TYPE_GPS_INS,
+    )  # fmt: skip
+
+
+def estimator_status(solution: Solution, _: Situation) -> Message | None:
+    """ESTIMATOR_STATUS: innovations over their gates, one sigma of the position, what is good."""
+    if not solution.has_sigma:
+        return None
+    ratio = solution.test_ratio
+    flags = _estimate_flags(solution)
+    if ratio[Ratio.POSITION] >= 1.0:
+        flags |= mav.ESTIMATOR_GPS_GLITCH
+    north, east, down = solution.sigma[:3]
+    return mav.MAVLink_estimator_status_message(
+        _boot_us(solution), flags, *_ratios(solution), 0.0, 0.0, math.hypot(north, east), down
+    )
+
+
+def ekf_status_report(solution: Solution, _: Situation) -> Message | None:
+    """EKF_STATUS_REPORT: the same for clients of ArduPilot; its variances are innovations over their gates."""
+    if not solution.has_sigma:
+        return None
+    flags = _estimate_flags(solution)
+    if solution.test_ratio[Ratio.POSITION] >= 1.0:
+        flags |= mav.EKF_GPS_GLITCHING
+    return mav.MAVLink_ekf_status_report_message(flags, *_ratios(solution), 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Kind:
     """One message of the table."""
@@ -207,7 +256,10 @@ KINDS = {
     "GLOBAL_POSITION_INT": Kind(global_position_int, 10.0, "SR_GPOS_HZ"),
     "LOCAL_POSITION_NED": Kind(local_position_ned, 10.0, "SR_LPOS_HZ"),
     "VFR_HUD": Kind(vfr_hud, 5.0, "SR_HUD_HZ"),
+    "ODOMETRY": Kind(odometry, 5.0, "SR_ODOM_HZ"),
     "ALTITUDE": Kind(altitude, 5.0, "SR_ALT_HZ"),
+    "ESTIMATOR_STATUS": Kind(estimator_status, 2.0, "SR_EST_HZ"),
+    "EKF_STATUS_REPORT": Kind(ekf_status_report, 2.0, "SR_EKF_HZ"),
     "SYSTEM_TIME": Kind(system_time, 1.0, "SR_TIME_HZ"),
     "GPS_RAW_INT": Kind(gps_raw_int, 1.0, "SR_GPS_HZ"),
     "SYS_STATUS": Kind(sys_status, 2.0, "SR_SYS_HZ", from_solution=False),
@@ -215,6 +267,28 @@ KINDS = {
     "HEARTBEAT": Kind(heartbeat, 1.0, "SR_BEAT_HZ", from_solution=False),
 }
 """Every message that is sent at a rate, most urgent first."""
+
+
+def _estimate_flags(solution: Solution) -> int:
+    """What is good; the bits are the same in ESTIMATOR_STATUS and EKF_STATUS_REPORT, 831 when all is."""
+    north, east, down, v_north, v_east, v_down, *attitude_sigma = solution.sigma
+    flags = int(mav.EKF_ATTITUDE if max(attitude_sigma) <= GOOD_ATTITUDE else 0)
+    if math.hypot(v_north, v_east) <= GOOD_VELOCITY_MS:
+        flags |= mav.EKF_VELOCITY_HORIZ
+    if v_down <= GOOD_VELOCITY_MS:
+        flags |= mav.EKF_VELOCITY_VERT
+    if math.hypot(north, east) <= GOOD_POSITION_M:
+        flags |= mav.EKF_POS_HORIZ_REL | mav.EKF_POS_HORIZ_ABS | mav.EKF_PRED_POS_HORIZ_REL | mav.EKF_PRED_POS_HORIZ_ABS
+    if down <= GOOD_POSITION_M:
+        flags |= mav.EKF_POS_VERT_ABS
+    return flags
+
+
+def _ratios(solution: Solution) -> tuple[float, float, float, float]:
+    """Of velocity, horizontal and vertical position (a fix is judged as a whole) and compass."""
+    ratio = solution.test_ratio
+    vertical = max(ratio[Ratio.POSITION], ratio[Ratio.HEIGHT])
+    return ratio[Ratio.VELOCITY], ratio[Ratio.POSITION], vertical, ratio[Ratio.DIRECTION]
 
 
 def _boot_ms(solution: Solution) -> int:

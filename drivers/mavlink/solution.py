@@ -21,6 +21,8 @@ _LARGEST = 1e30
 """Larger than any quantity and within single precision."""
 _LATEST_S = 9e9
 """Nanoseconds up to here fit 64 bits."""
+_WORST = 1e15
+"""Squares of sigmas up to here are within single precision."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,8 @@ class Solution:
     q_nb: tuple[float, float, float, float]
     w_ib_b: Vector
     f_b: Vector
+    sigma: tuple[float, ...]
+    test_ratio: tuple[float, ...]
     geoid: Undulation
 
     @classmethod
@@ -65,6 +69,8 @@ class Solution:
             q_nb=tuple(values["q_nb"].tolist()),
             w_ib_b=tuple(values["w_ib_b"].tolist()),
             f_b=tuple(values["f_b"].tolist()),
+            sigma=tuple(values["sigma"].tolist()),
+            test_ratio=tuple(values["test_ratio"].tolist()),
             geoid=geoid,
         )
 
@@ -84,6 +90,12 @@ class Solution:
         return self.has_attitude and _usable(self.lat, self.lon, self.height, *self.vel_n)
 
     @cached_property
+    def has_sigma(self) -> bool:
+        """Whether it is known how good position, velocity and attitude are: by an aided navigator only."""
+        known = all(0.0 <= one < _WORST for one in self.sigma) and _usable(*self.test_ratio)
+        return self.has_position and known
+
+    @cached_property
     def euler(self) -> Vector:
         """Heading [0, 2 pi), pitch, roll, rad."""
         heading, pitch, roll = euler_from_quaternion(self.q_nb).tolist()
@@ -93,6 +105,20 @@ class Solution:
     def altitude(self) -> float:
         """Height above mean sea level, m."""
         return self.height - self.geoid(self.lat, self.lon)
+
+    @cached_property
+    def vel_b(self) -> Vector:
+        """Velocity over the ground, body axes, m/s."""
+        w, x, y, z = self.q_nb
+        return _rotated((w, -x, -y, -z), self.vel_n)
+
+    @cached_property
+    def vel_b_variance(self) -> Vector:
+        """Variances of `vel_b`, of independent errors of `vel_n`, m^2/s^2."""
+        w, x, y, z = self.q_nb
+        axes = (_rotated((w, x, y, z), axis) for axis in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+        forward, right, down = (sum((c * s) ** 2 for c, s in zip(axis, self.sigma[3:6], strict=True)) for axis in axes)
+        return forward, right, down
 
     @cached_property
     def w_nb_b(self) -> Vector:
@@ -114,6 +140,22 @@ class Solution:
         sl, cl = math.sin(home.lon), math.cos(home.lon)
         outward = cl * dx + sl * dy
         return c * dz - s * outward, cl * dy - sl * dx, -(c * outward + s * dz)
+
+
+def geodetic(home: Home, ned: Vector) -> Vector:
+    """lat, lon (rad), height (m) of a point north, east, down of `home` in its local level, m; to micrometres within 100 km."""
+    s, c = math.sin(home.lat), math.cos(home.lat)
+    outward = -s * ned[0] - c * ned[2]
+    sl, cl = math.sin(home.lon), math.cos(home.lon)
+    offset = cl * outward - sl * ned[1], sl * outward + cl * ned[1], c * ned[0] - s * ned[2]
+    x, y, z = (a + b for a, b in zip(_ecef_of(home), offset, strict=True))
+    level, lat, height = math.hypot(x, y), home.lat, home.height
+    for _ in range(5):
+        prime = A / math.sqrt(1.0 - E2 * math.sin(lat) ** 2)
+        lat = math.atan2(z, level * (1.0 - E2 * prime / (prime + height)))
+        s, c = math.sin(lat), math.cos(lat)
+        height = level * c + z * s - A * math.sqrt(1.0 - E2 * s * s)
+    return lat, math.atan2(y, x), height
 
 
 def _usable(*values: float) -> bool:

@@ -5,9 +5,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.geometry import Spread, attitude_difference, position_error
+from hil.geometry import Spread, position_error
 from hil.scenario import Scenario
 from hil.world.motion import Motion
+from nav.increments import FloatArray
+from nav.rotation import attitude_error
 from nav.state import Mode
 
 RATE_HZ = 100.0
@@ -21,6 +23,7 @@ class TruthKeeper:
         self.motion = Motion(scenario.motion)
         self._every = max(1, round(scenario.head.rate_hz / RATE_HZ))
         self.position, self.velocity, self.attitude = Spread(), Spread(), Spread()
+        self._normal = {name: Spread() for name in ("position", "velocity", "attitude")}
 
     def compare(self, rows: NDArray[Any]) -> None:
         """Take solutions; those before the end of the alignment and those not of the grid are passed over."""
@@ -31,9 +34,20 @@ class TruthKeeper:
             return
         truth = self.motion.truth(np.ascontiguousarray(chosen["time"]))
         offset = position_error(chosen["lat"], chosen["lon"], chosen["height"], truth)
-        self.position.add(np.linalg.norm(offset, axis=1))
-        self.velocity.add(np.linalg.norm(chosen["vel_n"] - truth["vel_n"], axis=1))
-        self.attitude.add(attitude_difference(chosen["q_nb"], truth["q_nb"])[0])
+        errors = offset, chosen["vel_n"] - truth["vel_n"], attitude_error(chosen["q_nb"], truth["q_nb"])
+        for spread, error in zip((self.position, self.velocity, self.attitude), errors, strict=True):
+            spread.add(np.linalg.norm(error, axis=1))
+        self._compare_sigmas(np.concatenate(errors, axis=1), chosen["sigma"])
+
+    def _compare_sigmas(self, errors: FloatArray, sigmas: NDArray[np.float32]) -> None:
+        known = np.isfinite(sigmas).all(axis=1) & (sigmas > 0.0).all(axis=1)
+        normal = errors[known] / sigmas[known]
+        for spread, part in zip(self._normal.values(), (normal[:, :3], normal[:, 3:6], normal[:, 6:]), strict=True):
+            spread.add(part.ravel())
+
+    def ratios(self) -> dict[str, float]:
+        """Rms of error over sigma, of all axes: 1 where the estimate of the error is right; empty where there was none."""
+        return {name: spread.as_dict()["rms"] for name, spread in self._normal.items() if spread.count}
 
     def summary(self) -> dict[str, dict[str, float]] | None:
         """Errors by name, each rms, max, final; None when nothing was compared."""

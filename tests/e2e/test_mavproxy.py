@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hil.bridge import EVENTS
 from hil.control import Control
-from hil.publisher import run_publisher
+from hil.publisher import Taps, run_publisher
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
 from nav.rotation import quaternion_from_euler
@@ -52,7 +53,7 @@ def start(url: str) -> tuple[Any, Ring, Wake, Any]:
     spawn = get_context("spawn")
     ring, stop = Ring(NAV_STATE, 1024, 1), Wake()
     report, report_end = spawn.Pipe()
-    arguments = (MavlinkConfig(links=(url,)), ring, 0, Control(), stop, report_end)
+    arguments = (MavlinkConfig(links=(url,)), Taps(ring, 0, Ring(EVENTS, 16, 0), Control()), stop, report_end)
     process = spawn.Process(target=run_publisher, args=arguments)
     process.start()
     report_end.close()
@@ -95,7 +96,7 @@ def test_mavproxy_is_content(tmp_path: Path) -> None:
     assert "link 1 OK" in output
     assert "0.0% loss" in output
     assert "Detected vehicle 1:1" in output
-    assert "Received 15 parameters" in output
+    assert "Received 18 parameters" in output
     assert "SYSID_THISMAV" in output
     assert "online system 1" in output
     for warning in (

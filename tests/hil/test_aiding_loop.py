@@ -105,7 +105,7 @@ def test_a_wrong_frame_is_dropped_and_counted() -> None:
 
 def test_the_loop_navigates_by_them() -> None:
     """Free, a head of the tactical grade drifts from where it is; with a receiver it stays within the receiver's noise."""
-    errors = {}
+    errors, estimates = {}, {}
     for aided in (False, True):
         scenario = SCENARIO.with_changes(
             head={"instruments": "dtg", "grade": "tactical"},
@@ -116,9 +116,13 @@ def test_the_loop_navigates_by_them() -> None:
         for _, *parts in SimulatedHead(scenario).chunks(12_000):
             for part in parts:
                 loop.take(part)
-        errors[aided] = loop.result()["error"]
+        errors[aided], estimates[aided] = loop.result()["error"], loop.result().get("estimate")
     assert errors[True]["position_m"]["final"] < 3.0 < 0.2 * errors[False]["position_m"]["final"]
     assert errors[True]["velocity_ms"]["final"] < 0.1 < errors[False]["velocity_ms"]["final"]
+    assert estimates[False] is None
+    assert 0.1 < estimates[True]["sigma"]["position_m"] < 3.0
+    assert 0.0 < estimates[True]["sigma"]["attitude_deg"] < 1.0
+    assert all(0.1 < ratio < 3.0 for ratio in estimates[True]["ratio"].values())
 
 
 def test_what_is_withheld_is_counted_and_not_given() -> None:

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from hil.bridge import EVENTS
 from hil.control import Control
-from hil.publisher import run_publisher
+from hil.publisher import Taps, run_publisher
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
 from nav.rotation import euler_from_quaternion, quaternion_from_euler
@@ -37,7 +38,9 @@ class Running:
         self.control, self.stop = Control(), Wake()
         self.report, report = SPAWN.Pipe()
         links = config.pop("links", (f"udpout:127.0.0.1:{self.client.getsockname()[1]}",))
-        arguments = (MavlinkConfig(links=links, **config), self.ring, 0, self.control, self.stop, report)
+        self.events = Ring(EVENTS, 16, 0)
+        taps = Taps(self.ring, 0, self.events, self.control)
+        arguments = (MavlinkConfig(links=links, **config), taps, self.stop, report)
         self.process = SPAWN.Process(target=run_publisher, args=arguments)
         self.process.start()
         report.close()
@@ -163,6 +166,19 @@ def test_loss_of_samples_shows_in_the_status(running: Running) -> None:
     heard: list[Any] = []
     until(lambda: heard.extend(running.hear()) or types(heard)["SYS_STATUS"] > 1)
     assert [m for m in heard if m.get_type() == "SYS_STATUS"][-1].drop_rate_comm == 200
+    running.end()
+
+
+def test_events_for_ground_stations_are_told(running: Running) -> None:
+    until(running.hear)
+    running.feed(0.5)
+    rows = np.zeros(2, EVENTS)
+    rows["severity"], rows["text"] = b"warning", (b"between ourselves", b"GNSS position 0 is rejected: 12.3 sigma")
+    rows["station"] = False, True
+    running.events.push(rows)
+    texts = [m.text for m in running.feed(2.0) if m.get_type() == "STATUSTEXT"]
+    assert "GNSS position 0 is rejected: 12.3 sigma" in texts
+    assert "between ourselves" not in texts
     running.end()
 
 

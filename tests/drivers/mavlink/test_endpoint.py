@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.commands import MESSAGE_NAMES
-from drivers.mavlink.endpoint import Endpoint, Identity, Station
+from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.link import StreamLink, UdpLink, open_link
 from drivers.mavlink.messages import KINDS
+from drivers.mavlink.station import Identity, Station
 from nav.errors import HilError
 from nav.state import NAV_STATE, Health, Mode
 
@@ -318,6 +319,27 @@ def test_changes_are_told_once_in_words(bench: Bench) -> None:
         (mav.MAV_SEVERITY_INFO, "Navigating"),
         (mav.MAV_SEVERITY_INFO, "Over: The sensor reports a fault"),
     ]
+
+
+def test_notes_are_told_once_on_every_link_and_in_order(bench: Bench) -> None:
+    bench.run(1.0)
+    long = "the filter had diverged: it starts again where GNSS says"
+    bench.station.tell("warning", "GNSS position 0 is rejected: 12.3 sigma")
+    bench.station.tell("notice", long)
+    told = [m for m in bench.run(3.0) if m.get_type() == "STATUSTEXT"]
+    assert (told[0].severity, told[0].text) == (mav.MAV_SEVERITY_WARNING, "GNSS position 0 is rejected: 12.3 sigma")
+    assert (told[0].id, told[0].chunk_seq) == (0, 0)
+    assert {m.id for m in told[1:]} == {1}
+    assert [m.chunk_seq for m in told[1:]] == [0, 1]
+    assert "".join(m.text for m in told[1:]) == long
+
+
+def test_of_too_many_notes_the_newest_are_told(bench: Bench) -> None:
+    bench.run(1.0)
+    for k in range(100):
+        bench.station.tell("info", f"note {k}")
+    told = [m.text for m in bench.run(20.0, rate_hz=20.0) if m.get_type() == "STATUSTEXT"]
+    assert told == [f"note {k}" for k in range(84, 100)]
 
 
 def test_a_flapping_flag_does_not_fill_the_link(bench: Bench) -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
+from scipy.spatial.transform import Rotation
 
 from drivers.mavlink.messages import KINDS, Situation
 from drivers.mavlink.solution import Home, Solution
@@ -17,6 +18,10 @@ from nav.state import NAV_STATE, Health, Mode
 
 EARTH_RATE = 7.292115e-5
 GEOID_M = 25.0
+SIGMA = (0.3, 0.4, 0.7, 0.03, 0.02, 0.05, 1e-3, 2e-3, 3e-3)
+COVARIANCES = {"pose_covariance", "velocity_covariance"}
+"""Fields in which NaN says "unknown"."""
+DIAGONAL = [k for k, (i, j) in enumerate(zip(*np.triu_indices(6), strict=True)) if i == j]
 
 
 def row(**changes: Any) -> np.ndarray:
@@ -31,9 +36,12 @@ def row(**changes: Any) -> np.ndarray:
         "vel_n": (3.0, -4.0, 0.5),
         "q_nb": quaternion_from_euler(math.radians(300.0), math.radians(5.0), math.radians(-10.0)),
         "f_b": (0.1, 0.2, -9.8),
+        "sigma": SIGMA,
+        "test_ratio": (0.5, 0.25, 0.75, 0.125, 0.0),
     }
-    for key, value in (values | changes).items():
-        made[key] = value
+    with np.errstate(over="ignore"):  # single precision has room for the sigmas of nonsense as infinities
+        for key, value in (values | changes).items():
+            made[key] = value
     return made
 
 
@@ -64,7 +72,8 @@ def test_every_message_survives_the_wire(name: str) -> None:
     message = decoded(name)
     for field in message.get_fieldnames():
         value = getattr(message, field)
-        assert all(math.isfinite(v) for v in (value if isinstance(value, list) else [value])), field
+        values = value if isinstance(value, list) else [value]
+        assert field in COVARIANCES or all(math.isfinite(v) for v in values), field
 
 
 @pytest.mark.parametrize(
@@ -154,6 +163,70 @@ def test_position_is_above_mean_sea_level_and_relative_to_home() -> None:
     assert message.hdg == 30000
 
 
+def test_odometry_is_the_solution_in_body_axes() -> None:
+    message, local = decoded("ODOMETRY"), decoded("LOCAL_POSITION_NED")
+    assert (message.frame_id, message.child_frame_id) == (mav.MAV_FRAME_LOCAL_NED, mav.MAV_FRAME_BODY_FRD)
+    assert (message.x, message.y, message.z) == (local.x, local.y, local.z)
+    to_n = Rotation.from_quat(message.q, scalar_first=True)
+    assert to_n.apply([message.vx, message.vy, message.vz]) == pytest.approx([3.0, -4.0, 0.5], abs=1e-6)
+
+
+def test_covariances_of_the_odometry_are_the_sigmas() -> None:
+    message = decoded("ODOMETRY")
+    pose = np.array(message.pose_covariance)
+    assert pose[DIAGONAL] == pytest.approx(np.square(SIGMA[:3] + SIGMA[6:]))
+    assert np.isnan(np.delete(pose, DIAGONAL)).all()
+    c = Rotation.from_quat(message.q, scalar_first=True).as_matrix()
+    expected = np.diag(c.T @ np.diag(np.square(SIGMA[3:6])) @ c)
+    assert np.array(message.velocity_covariance)[DIAGONAL[:3]] == pytest.approx(expected)
+
+
+def test_an_unaided_navigator_claims_nothing_of_its_accuracy() -> None:
+    unknown = solution(sigma=np.full(9, np.inf))
+    assert KINDS["ESTIMATOR_STATUS"].build(unknown, SITUATION) is None
+    assert KINDS["EKF_STATUS_REPORT"].build(unknown, SITUATION) is None
+    message = decoded("ODOMETRY", sigma=np.full(9, np.inf))
+    assert np.isnan(message.pose_covariance).all()
+    assert np.isnan(message.velocity_covariance).all()
+
+
+def test_a_good_estimate_is_called_good() -> None:
+    """831 is what clients of ArduPilot take for healthy."""
+    status, report = decoded("ESTIMATOR_STATUS"), decoded("EKF_STATUS_REPORT")
+    assert status.flags == report.flags == 831
+    assert (status.vel_ratio, status.pos_horiz_ratio, status.pos_vert_ratio, status.mag_ratio) == (
+        0.5,
+        0.25,
+        0.75,
+        0.125,
+    )
+    assert (report.velocity_variance, report.pos_horiz_variance, report.compass_variance) == (0.5, 0.25, 0.125)
+    assert status.pos_horiz_accuracy == pytest.approx(0.5)
+    assert status.pos_vert_accuracy == pytest.approx(0.7)
+
+
+@pytest.mark.parametrize(
+    ("place", "sigma", "lost"),
+    [
+        (0, 100.0, mav.EKF_POS_HORIZ_ABS | mav.EKF_POS_HORIZ_REL | mav.EKF_PRED_POS_HORIZ_ABS | mav.EKF_PRED_POS_HORIZ_REL),
+        (2, 100.0, mav.EKF_POS_VERT_ABS),
+        (4, 10.0, mav.EKF_VELOCITY_HORIZ),
+        (5, 10.0, mav.EKF_VELOCITY_VERT),
+        (8, 1.0, mav.EKF_ATTITUDE),
+    ],
+)  # fmt: skip
+def test_what_is_not_good_is_not_called_so(place: int, sigma: float, lost: int) -> None:
+    changed = [sigma if k == place else one for k, one in enumerate(SIGMA)]
+    assert decoded("ESTIMATOR_STATUS", sigma=changed).flags == 831 & ~lost
+    assert decoded("EKF_STATUS_REPORT", sigma=changed).flags == 831 & ~lost
+
+
+def test_a_rejected_fix_is_a_glitch() -> None:
+    ratio = (0.5, 2.0, 0.0, 0.0, 0.0)
+    assert decoded("ESTIMATOR_STATUS", test_ratio=ratio).flags & mav.ESTIMATOR_GPS_GLITCH
+    assert decoded("EKF_STATUS_REPORT", test_ratio=ratio).flags & mav.EKF_GPS_GLITCHING
+
+
 @given(st.floats(0.0, 2.0 * math.pi))
 def test_heading_stays_in_range(heading: float) -> None:
     q_nb = quaternion_from_euler(heading, 0.0, 0.0)
@@ -207,6 +280,7 @@ vectors = st.tuples(numbers, numbers, numbers)
 
 @given(
     time=numbers, lat=numbers, lon=numbers, height=numbers, vel_n=vectors, w_ib_b=vectors, f_b=vectors,
+    sigma=st.lists(numbers, min_size=9, max_size=9), test_ratio=st.lists(numbers, min_size=5, max_size=5),
     q_nb=st.one_of(st.tuples(numbers, numbers, numbers, numbers), st.just((0.6, 0.0, 0.8, 0.0))),
 )  # fmt: skip
 def test_nonsense_is_left_out_and_never_sent(**fields: Any) -> None:
@@ -218,4 +292,6 @@ def test_nonsense_is_left_out_and_never_sent(**fields: Any) -> None:
         message = over_the_wire(message)
         for field in message.get_fieldnames():
             value = getattr(message, field)
-            assert all(math.isfinite(v) for v in (value if isinstance(value, list) else [value])), field
+            values = value if isinstance(value, list) else [value]
+            assert field in COVARIANCES or all(math.isfinite(v) for v in values), field
+            assert not any(math.isinf(v) for v in values), field

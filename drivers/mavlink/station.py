@@ -1,0 +1,153 @@
+"""What all links of a MAVLink component share: identity, the newest solution, home, parameters, notes.
+
+Nothing here has a thread or a clock: the caller says what time it is.
+"""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import ardupilotmega as mav
+
+from drivers.mavlink.commands import SHORTEST_INTERVAL_S
+from drivers.mavlink.intake import Intake
+from drivers.mavlink.messages import KINDS, VEHICLES, Situation
+from drivers.mavlink.parameters import Parameter, Parameters
+from drivers.mavlink.solution import Home, Solution, Undulation
+from nav.errors import HilError
+from nav.state import NAV_STATE, Health, Mode
+
+_SLOWEST_HEARTBEAT_HZ = 0.5
+_NOTES = 16
+"""Most notes that wait to be told."""
+_SEVERITIES = {
+    "info": mav.MAV_SEVERITY_INFO,
+    "notice": mav.MAV_SEVERITY_NOTICE,
+    "warning": mav.MAV_SEVERITY_WARNING,
+    "error": mav.MAV_SEVERITY_ERROR,
+}
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who we are on the network."""
+
+    system_id: int = 1
+    component_id: int = 1
+    vehicle: str = "fixed-wing"
+
+
+class Station:
+    """What all links share.
+
+    Parameters
+    ----------
+    identity : Identity
+        System, component, vehicle type (a key of `messages.VEHICLES`).
+    rates_hz : mapping
+        Message name to rate, over the built-in ones; 0 switches a message off.
+    geoid : callable
+        (lat, lon), rad, to the height of the geoid above the ellipsoid, m.
+    on_command : callable
+        Called with the name of what a ground station wants done: ``"align"``.
+    intake : Intake, optional
+        Takes what aids the navigator; without it nothing does.
+
+    Raises
+    ------
+    HilError
+        An unknown message name or vehicle, or a rate out of range.
+    """
+
+    def __init__(
+        self,
+        identity: Identity,
+        rates_hz: Mapping[str, float],
+        geoid: Undulation,
+        on_command: Callable[[str], None],
+        intake: Intake | None = None,
+    ) -> None:
+        if identity.vehicle not in VEHICLES:
+            raise HilError(f"mavlink.vehicle = {identity.vehicle!r}: unknown; expected one of {', '.join(VEHICLES)}")
+        for name, rate_hz in rates_hz.items():
+            if name not in KINDS:
+                raise HilError(f"mavlink.rates_hz.{name}: unknown message; expected one of {', '.join(KINDS)}")
+            lowest = _SLOWEST_HEARTBEAT_HZ if name == "HEARTBEAT" else 0.0
+            if not lowest <= rate_hz <= 1.0 / SHORTEST_INTERVAL_S:
+                raise HilError(f"mavlink.rates_hz.{name} = {rate_hz}: expected {lowest:g} to 1000 Hz")
+        self.identity = identity
+        self.geoid = geoid
+        self.on_command = on_command
+        self.intake = intake
+        self.on_rate: list[Callable[[str], None]] = []
+        self._rates_hz = {name: kind.rate_hz for name, kind in KINDS.items()} | dict(rates_hz)
+        self.parameters = Parameters(self._table())
+        self.situation = Situation(vehicle_type=VEHICLES[identity.vehicle])
+        self.solution = Solution.of(np.zeros(1, NAV_STATE)[0], geoid)
+        self.number = 0
+        """Counts solutions; 0 before the first one."""
+        self.notes: deque[tuple[int, str]] = deque(maxlen=_NOTES)
+        """The newest notes: severity and text."""
+        self.noted = 0
+        """Counts notes."""
+        self.now_s = 0.0
+        self._updated_s = 0.0
+
+    def update(self, row: Any, now_s: float) -> None:
+        """Take a new solution, one record of `NAV_STATE`; the first one that navigates sets home."""
+        self.solution = Solution.of(row, self.geoid)
+        self.number += 1
+        self.now_s = self._updated_s = now_s
+        if self.situation.home is None and self.solution.mode == Mode.NAVIGATE and self.solution.has_position:
+            home = Home(self.solution.lat, self.solution.lon, self.solution.height)
+            self.situation = replace(self.situation, home=home)
+
+    def silence(self) -> None:
+        """No solution has come for too long: say so in status and text until the next one."""
+        mode = Mode.DEGRADED if self.solution.mode == Mode.NAVIGATE else self.solution.mode
+        self.solution = replace(self.solution, mode=mode, health=self.solution.health | Health.SILENT)
+
+    def tell(self, severity: str, text: str) -> None:
+        """Have something said on every link: ``"info"``, ``"notice"``, ``"warning"`` or ``"error"``."""
+        self.notes.append((int(_SEVERITIES[severity]), text))
+        self.noted += 1
+
+    def set_loss(self, lost: int, samples: int) -> None:
+        """Sensor samples lost and received since the start."""
+        if (lost, samples) != (self.situation.lost, self.situation.samples):
+            self.situation = replace(self.situation, lost=lost, samples=samples)
+
+    def device_ns(self) -> int:
+        """Device time now, ns; the caller's clock before the first solution."""
+        start_s = self.solution.time if self.number and self.solution.has_imu else 0.0
+        return int(1e9 * (start_s + self.now_s - self._updated_s))
+
+    def interval_s(self, name: str) -> float:
+        """Interval that message `name` has on a new link, s; 0 when it is off."""
+        rate_hz = self._rates_hz[name]
+        return 1.0 / rate_hz if rate_hz > 0.0 else 0.0
+
+    def _table(self) -> list[Parameter]:
+        identity = self.identity
+        table = [
+            Parameter("SYSID_THISMAV", lambda: float(identity.system_id)),
+            Parameter("HIL_COMPID", lambda: float(identity.component_id)),
+            Parameter("HIL_VEHICLE", lambda: float(VEHICLES[identity.vehicle])),
+        ]
+        for name, kind in KINDS.items():
+            lowest = _SLOWEST_HEARTBEAT_HZ if name == "HEARTBEAT" else 0.0
+            table.append(Parameter(kind.parameter, self._get(name), self._set(name), lowest, 1.0 / SHORTEST_INTERVAL_S))
+        return table
+
+    def _get(self, name: str) -> Callable[[], float]:
+        return lambda: self._rates_hz[name]
+
+    def _set(self, name: str) -> Callable[[float], None]:
+        def change(rate_hz: float) -> None:
+            self._rates_hz[name] = rate_hz
+            for told in self.on_rate:
+                told(name)
+
+        return change
