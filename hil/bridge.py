@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, is_aiding
+from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from drivers.can.frames import FrameArray, frames
 from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
@@ -38,9 +39,11 @@ from hil.world.instruments import head_model
 from hil.world.truth import TruthKeeper
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
-from nav.filter.states import SENSOR_BLOCKS, Block, tuning
+from nav.filter.assumptions import Assumptions, Bounds
+from nav.filter.states import SENSOR_BLOCKS, Block, Tuning, tuning
+from nav.filter.stillness import Stillness
 from nav.gaps import GapPolicy
-from nav.increments import HeadIncrements, ImuIncrements, IntArray
+from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
 from nav.instruments.grades import GRADES
 from nav.instruments.head import HeadCombiner
 from nav.navigator import Aiding, Navigator, Settings
@@ -131,10 +134,28 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     grade = GRADES["dtg" if head.grade == "none" else head.grade]
     arm = np.subtract(aiding.gnss[0].lever_arm_m, head.lever_arm_m) if aiding.gnss else np.zeros(3)
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
+    believed = tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=True)
+    assumptions, tilt = _assumptions_of(scenario, believed), math.radians(0.01)
+    if assumptions is not None:  # what is measured at rest ties the tilt to the accelerometers' biases, which alone are its doubt
+        tilt = max(tilt, 10.0 * grade.accelerometer_bias / 9.80665)
     return Aiding(
-        tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=True),
+        believed,
         FilterSettings(lever_arm=_three(arm), field_n=_three(field_n)),
-        np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, *np.radians([0.01, 0.01, 0.2])]),
+        np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, tilt, tilt, math.radians(0.2)]),
+        assumptions,
+    )
+
+
+def _assumptions_of(scenario: Scenario, believed: Tuning) -> Assumptions | None:
+    assume, bounds = scenario.navigation.assume, scenario.navigation.assume.bounds
+    if assume.rest == "never" and bounds is None:
+        return None
+    rate_white, force_white = float(believed.white[:3].max()), float(believed.white[3:].max())
+    return Assumptions(
+        Stillness(rate_white, force_white, ANGLE_LSB, VELOCITY_LSB[scenario.head.layout]),
+        assume.rest == "detected",
+        assume.smooth_ms,
+        None if bounds is None else Bounds(bounds.acceleration_ms2, bounds.speed_ms, bounds.place_m),
     )
 
 
@@ -349,11 +370,20 @@ class Loop:
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
+        if (sigma := self.navigator.sigma) is not None:
+            result["sigma"] = _total(sigma)
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
             if self._keep_trace:
                 result["trace"] = self._trace.arrays()
         return result
+
+
+def _total(sigma: FloatArray) -> dict[str, float]:
+    """What the filter says of the errors as the summary names them: roots of summed variances of `Navigator.sigma`."""
+    parts = {"position_m": sigma[0:3], "velocity_ms": sigma[3:6], "tilt_deg": sigma[6:8], "heading_deg": sigma[8:9]}
+    angle = {"tilt_deg": math.degrees(1.0), "heading_deg": math.degrees(1.0)}
+    return {name: angle.get(name, 1.0) * math.hypot(*part) for name, part in parts.items()}
 
 
 def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:

@@ -17,6 +17,7 @@ from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.errors import HilError
 from nav.filter.aided import AidedNavigator
 from nav.filter.aided import Settings as FilterSettings
+from nav.filter.assumptions import Assumed, Assumptions
 from nav.filter.states import GYRO_BIAS, Tuning
 from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
@@ -53,11 +54,14 @@ class Aiding:
         How the filter is run.
     sigma : (9,) float
         Of the start, at least: position and velocity north, east, down (m, m/s), attitude about them (rad).
+    assumptions : Assumptions, optional
+        What is known without another sensor.
     """
 
     tuning: Tuning
     filter: FilterSettings
     sigma: FloatArray
+    assumptions: Assumptions | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,7 @@ class Navigator:
         self._core = Strapdown(settings.attitude, settings.mechanization, settings.gravity)
         aiding = settings.aiding
         self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter)
+        self._assumed = None if aiding is None or aiding.assumptions is None else Assumed(aiding.assumptions)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -137,6 +142,15 @@ class Navigator:
         self._events: list[Event] = []
         self._rows = np.zeros(256, NAV_STATE)
         self._scratch = (np.empty((256, 3)), np.empty((256, 3)), np.empty((256, 4)))
+
+    @property
+    def sigma(self) -> FloatArray | None:
+        """(9,): one sigma of position and velocity north, east, down, m, m/s, and of the attitude about them, rad.
+
+        None where there is no filter or it has not started.
+        """
+        started = self._aided is not None and self._aided.time > -math.inf
+        return self._aided.sigma[:9] if self._aided is not None and started else None
 
     def events(self) -> list[Event]:
         """What happened since the last call."""
@@ -258,6 +272,8 @@ class Navigator:
         sigma[6:9] = np.maximum(sigma[6:9], [sigma_tilt, sigma_tilt, sigma_heading])
         self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma)
         self._aided.estimates[GYRO_BIAS] = self.gyro_bias
+        if self._assumed is not None:
+            self._assumed.start(lat, lon, height)
 
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):
@@ -330,7 +346,9 @@ class Navigator:
 
     def _navigate(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
         event = 0
-        if self.settings.track_bias_at_rest:
+        if self._assumed is not None:
+            stop = start + self._assumed.detector.take(imu.rows(start, stop))
+        elif self.settings.track_bias_at_rest:
             used, event = rest.accumulate(
                 self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], REST_WINDOW_S
             )
@@ -366,6 +384,8 @@ class Navigator:
         part["progress"] = 1.0
         if event == 2:
             self._track_bias()
+        if self._assumed is not None and self._aided is not None and self._assumed.detector.decided:
+            self.aid(self._assumed.rows(self._aided))
         return n
 
     def _flag(self, time: float, flagged: int) -> None:

@@ -21,6 +21,7 @@ class TruthKeeper:
         self.motion = Motion(scenario.motion)
         self._every = max(1, round(scenario.head.rate_hz / RATE_HZ))
         self.position, self.velocity, self.attitude = Spread(), Spread(), Spread()
+        self.tilt, self.heading = Spread(), Spread()
 
     def compare(self, rows: NDArray[Any]) -> None:
         """Take solutions; those before the end of the alignment and those not of the grid are passed over."""
@@ -33,7 +34,12 @@ class TruthKeeper:
         offset = position_error(chosen["lat"], chosen["lon"], chosen["height"], truth)
         self.position.add(np.linalg.norm(offset, axis=1))
         self.velocity.add(np.linalg.norm(chosen["vel_n"] - truth["vel_n"], axis=1))
-        self.attitude.add(attitude_difference(chosen["q_nb"], truth["q_nb"])[0])
+        for spread, angle in zip(
+            (self.attitude, self.tilt, self.heading),
+            attitude_difference(chosen["q_nb"], truth["q_nb"]),
+            strict=True,
+        ):
+            spread.add(angle)
 
     def summary(self) -> dict[str, dict[str, float]] | None:
         """Errors by name, each rms, max, final; None when nothing was compared."""
@@ -43,4 +49,6 @@ class TruthKeeper:
             "position_m": self.position.as_dict(),
             "velocity_ms": self.velocity.as_dict(),
             "attitude_deg": self.attitude.as_dict(180.0 / np.pi),
+            "tilt_deg": self.tilt.as_dict(180.0 / np.pi),
+            "heading_deg": self.heading.as_dict(180.0 / np.pi),
         }
