@@ -85,7 +85,7 @@ class Stillness:
 
 
 def chi_square_quantile(probability: float, freedom: int) -> float:
-    """Of many degrees of freedom, by Wilson & Hilferty: within 1 per cent from 6 of them on."""
+    """Of many degrees of freedom, by Wilson & Hilferty: within 4 per cent up to 1 - 1e-6, from 6 of them on."""
     share = 2.0 / (9.0 * freedom)
     return freedom * (1.0 - share + NormalDist().inv_cdf(probability) * math.sqrt(share)) ** 3
 
