@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, is_aiding
+from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from drivers.can.frames import FrameArray, frames
 from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
@@ -40,10 +41,12 @@ from hil.world.truth import TruthKeeper
 from nav.aiding import Kind
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
+from nav.filter.assumptions import Assumptions, Bounds
 from nav.filter.record import Recorder
-from nav.filter.states import SENSOR_BLOCKS, Block, tuning
+from nav.filter.states import SENSOR_BLOCKS, Block, Tuning, tuning
+from nav.filter.stillness import Stillness
 from nav.gaps import GapPolicy
-from nav.increments import HeadIncrements, ImuIncrements, IntArray
+from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
 from nav.instruments.grades import GRADES
 from nav.instruments.head import HeadCombiner
 from nav.navigator import Aiding, Navigator, Settings
@@ -151,16 +154,36 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     if chosen.declination_deg is not None:
         there, level = math.radians(chosen.declination_deg), math.hypot(field_n[0], field_n[1])
         field_n[:2] = level * math.cos(there), level * math.sin(there)
+    believed = tuning(
+        grade,
+        (*SENSOR_BLOCKS, Block.BAROMETER_BIAS),
+        bias_removed=True,
+        barometer=BAROMETER_M,
+        barometer_walk=chosen.barometer_m_sqrt_s,
+    )
+    assumptions = _assumptions_of(scenario, believed)
+    if (
+        assumptions is not None
+    ):  # what is measured at rest ties the tilt to the accelerometers' biases, which alone are its doubt
+        tilt *= 10.0
     return Aiding(
-        tuning(
-            grade,
-            (*SENSOR_BLOCKS, Block.BAROMETER_BIAS),
-            bias_removed=True,
-            barometer=BAROMETER_M,
-            barometer_walk=chosen.barometer_m_sqrt_s,
-        ),
+        believed,
         FilterSettings(lever_arm=_three(arm), field_n=_three(field_n), magnetic_heading=chosen.magnetic == "heading"),
         np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, tilt, tilt, math.radians(start.heading_sigma_deg)]),
+        assumptions,
+    )
+
+
+def _assumptions_of(scenario: Scenario, believed: Tuning) -> Assumptions | None:
+    assume, bounds = scenario.navigation.assume, scenario.navigation.assume.bounds
+    if assume.rest == "never" and bounds is None:
+        return None
+    rate_white, force_white = float(believed.white[:3].max()), float(believed.white[3:].max())
+    return Assumptions(
+        Stillness(rate_white, force_white, ANGLE_LSB, VELOCITY_LSB[scenario.head.layout]),
+        assume.rest == "detected",
+        assume.smooth_ms,
+        None if bounds is None else Bounds(bounds.acceleration_ms2, bounds.speed_ms, bounds.place_m),
     )
 
 
@@ -392,15 +415,24 @@ class Loop:
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
-        position, velocity, attitude = (float(np.linalg.norm(part)) for part in np.split(self._last()["sigma"], 3))
-        if math.isfinite(position + velocity + attitude) and self._samples:
-            sigma = {"position_m": position, "velocity_ms": velocity, "attitude_deg": math.degrees(attitude)}
+        if self._samples and (sigma := _totals(self._last()["sigma"].astype(float))) is not None:
             result["estimate"] = {"sigma": sigma, "ratio": self._truth.ratios() if self._truth is not None else {}}
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
             if self._keep_trace:
                 result["trace"] = self._trace.arrays()
         return result
+
+
+def _totals(sigma: FloatArray) -> dict[str, float] | None:
+    """Roots of summed variances of the sigmas of a `NAV_STATE` row (9,), as the summary names them; None: not known."""
+    if not np.isfinite(sigma).all():
+        return None
+    parts = {"position_m": sigma[0:3], "velocity_ms": sigma[3:6]}
+    angles = {"attitude_deg": sigma[6:9], "tilt_deg": sigma[6:8], "heading_deg": sigma[8:9]}
+    return {name: math.hypot(*part) for name, part in parts.items()} | {
+        name: math.degrees(math.hypot(*part)) for name, part in angles.items()
+    }
 
 
 def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:

@@ -280,6 +280,27 @@ class FilterConfig(_Model):
     withheld: tuple[WithheldConfig, ...] = ()
 
 
+class BoundsConfig(_Model):
+    """What the vehicle does on the long run, one sigma of each axis."""
+
+    acceleration_ms2: Positive
+    """The specific force is the vertical but for this, and for more where it manoeuvres."""
+    speed_ms: Positive
+    place_m: Positive
+    """Distance from the start."""
+
+
+class AssumeConfig(_Model):
+    """What the filter may know of the vehicle without another sensor (:mod:`nav.filter.assumptions`)."""
+
+    rest: Literal["never", "detected"] = "never"
+    """``detected``: a vehicle whose inertial samples are still, and that is not known to move, is at rest."""
+    smooth_ms: Positive = 5.0
+    """From this speed on the vehicle may move as smoothly as it stands: no rest is assumed unless it is known to be slower."""
+    bounds: BoundsConfig | None = None
+    """Attitude and heading without a receiver: gravity is the vertical, velocity and place are bounded."""
+
+
 class NavigationConfig(_Model):
     """The navigation core."""
 
@@ -300,8 +321,15 @@ class NavigationConfig(_Model):
     aided: bool = False
     """Use what comes besides the inertial samples: the error-state filter corrects the navigator."""
     filter: FilterConfig = FilterConfig()
+    assume: AssumeConfig = AssumeConfig()
     track_bias_at_rest: bool = False
     """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "NavigationConfig":
+        if self.assume != AssumeConfig(smooth_ms=self.assume.smooth_ms) and not self.aided:
+            raise ValueError("assume needs the filter: aided = true")
+        return self
 
 
 class MavlinkConfig(_Model):

@@ -17,6 +17,7 @@ from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
 from nav.errors import HilError
 from nav.filter.aided import AidedNavigator
 from nav.filter.aided import Settings as FilterSettings
+from nav.filter.assumptions import Assumed, Assumptions
 from nav.filter.record import Recorder
 from nav.filter.states import GYRO_BIAS, Tuning
 from nav.filter.watch import Watch
@@ -55,11 +56,14 @@ class Aiding:
         How the filter is run.
     sigma : (9,) float
         Of the start, at least: position and velocity north, east, down (m, m/s), attitude about them (rad).
+    assumptions : Assumptions, optional
+        What is known without another sensor.
     """
 
     tuning: Tuning
     filter: FilterSettings
     sigma: FloatArray
+    assumptions: Assumptions | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +130,7 @@ class Navigator:
         aiding = settings.aiding
         self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter, recorder)
         self._watch = None if self._aided is None else Watch(self._aided)
+        self._assumed = None if aiding is None or aiding.assumptions is None else Assumed(aiding.assumptions)
         if settings.alignment == "level" and settings.heading is None:
             raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
         self.settings = settings
@@ -265,6 +270,8 @@ class Navigator:
         self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma, self.gyro_bias)
         if self._watch is not None:
             self._watch.start()
+        if self._assumed is not None:
+            self._assumed.start(lat, lon, height)
 
     def _room(self, n: int) -> StateArray:
         if n + 1 > len(self._rows):
@@ -341,7 +348,9 @@ class Navigator:
             stop = start + self._watch.part(imu.time[start:stop])
             for note in self._watch.notes():
                 self.tell(note.time, "warning" if note.bad else "notice", note.text, station=True)
-        if self.settings.track_bias_at_rest:
+        if self._assumed is not None:
+            stop = start + self._assumed.detector.take(imu.rows(start, stop))
+        elif self.settings.track_bias_at_rest:
             used, event = rest.accumulate(
                 self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], REST_WINDOW_S
             )
@@ -378,6 +387,8 @@ class Navigator:
         self._fill_worth(part)
         if event == 2:
             self._track_bias()
+        if self._assumed is not None and self._aided is not None and self._assumed.detector.decided:
+            self.aid(self._assumed.rows(self._aided))
         return n
 
     def _flag(self, time: float, flagged: int) -> None:

@@ -109,6 +109,7 @@ def limits_of(head: HeadConfig) -> Limits:
         factor * grade.gyro_misalignment,
         GYRO_RANGE,
         limit,
+        factor * grade.gyro_bias,
     )
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hil.geometry import Spread, position_error
+from hil.geometry import Spread, attitude_difference, position_error
 from hil.scenario import Scenario
 from hil.world.motion import Motion
 from nav.increments import FloatArray
@@ -24,6 +24,7 @@ class TruthKeeper:
         self._every = max(1, round(scenario.head.rate_hz / RATE_HZ))
         self.position, self.velocity, self.attitude = Spread(), Spread(), Spread()
         self._normal = {name: Spread() for name in ("position", "velocity", "attitude")}
+        self.tilt, self.heading = Spread(), Spread()
 
     def compare(self, rows: NDArray[Any]) -> None:
         """Take solutions; those before the end of the alignment and those not of the grid are passed over."""
@@ -35,8 +36,11 @@ class TruthKeeper:
         truth = self.motion.truth(np.ascontiguousarray(chosen["time"]))
         offset = position_error(chosen["lat"], chosen["lon"], chosen["height"], truth)
         errors = offset, chosen["vel_n"] - truth["vel_n"], attitude_error(chosen["q_nb"], truth["q_nb"])
-        for spread, error in zip((self.position, self.velocity, self.attitude), errors, strict=True):
-            spread.add(np.linalg.norm(error, axis=1))
+        self.position.add(np.linalg.norm(errors[0], axis=1))
+        self.velocity.add(np.linalg.norm(errors[1], axis=1))
+        angles = attitude_difference(chosen["q_nb"], truth["q_nb"])
+        for spread, angle in zip((self.attitude, self.tilt, self.heading), angles, strict=True):
+            spread.add(angle)
         self._compare_sigmas(np.concatenate(errors, axis=1), chosen["sigma"])
 
     def _compare_sigmas(self, errors: FloatArray, sigmas: NDArray[np.float32]) -> None:
@@ -57,4 +61,6 @@ class TruthKeeper:
             "position_m": self.position.as_dict(),
             "velocity_ms": self.velocity.as_dict(),
             "attitude_deg": self.attitude.as_dict(180.0 / np.pi),
+            "tilt_deg": self.tilt.as_dict(180.0 / np.pi),
+            "heading_deg": self.heading.as_dict(180.0 / np.pi),
         }

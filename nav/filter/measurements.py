@@ -372,12 +372,14 @@ def earth_rate(
         if not sigma[i] < math.inf:
             continue
         cx, cy, cz = c[0, i], c[1, i], c[2, i]
-        residual[m] = instant[_RATE_MEAN + i] - cx * north - cz * down
+        earth = cx * north + cz * down
+        residual[m] = instant[_RATE_MEAN + i] - earth
         variance[m] = sigma[i] * sigma[i]
         h[m] = 0.0
         x, y, z = cross(cx, cy, cz, north, 0.0, down)
         h[m, 6], h[m, 7], h[m, 8] = -x, -y, -z
-        h[m, 9 + i], h[m, 15 + i], h[m, 21 + i] = 1.0, instant[_RATE_MEAN + i], instant[_FORCE_MEAN + i]
+        # The scale factor goes with the true rate: the measured one is noise, and its square would be learnt.
+        h[m, 9 + i], h[m, 15 + i], h[m, 21 + i] = 1.0, earth, instant[_FORCE_MEAN + i]
         m += 1
     return m
 

@@ -8,7 +8,7 @@ are flagged: a noisy or saturated axis then goes on being used, a dead one count
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 
@@ -115,11 +115,7 @@ class HeadCombiner:
         self._lag = None if self._rotors is None else LagCompensator(*self._rotors)
         self._size = size_coefficients(model.pendulums) if model.pendulums else None
         self._size_memory = np.zeros(SIZE_MEMORY)
-        limits = model.limits
-        self._limits = (
-            *(limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale, limits.gyro_misalignment),
-            *(limits.gyro_range, limits.accelerometer_range),
-        )
+        self._limits = astuple(model.limits)
         self._notes: list[Note] = []
         self.faults = np.zeros(7, np.int64)
         self.residual = np.zeros(0)

@@ -37,8 +37,8 @@ NOISE_LIMIT = 30.0
 PARITY_BLOCK_S, PARITY_BLOCKS = 0.005, 10
 """The parity residual is averaged over ten blocks of 5 ms."""
 PARITY_SIGMAS, TURN_ON_SIGMAS = 6.5, 4.0
-"""The averaged residual is a fault above so many standard deviations of its noise, and of what scale factors and
-misalignments make of the mean rate."""
+"""The averaged residual is a fault above so many standard deviations of its noise, and of what biases, and scale factors and
+misalignments by the mean rate, make of it."""
 _DIFFERENCE_GAIN = 924.0
 """Sum of the squares of the sixth difference's coefficients."""
 
@@ -67,6 +67,8 @@ class Limits:
         Standard deviations of scale factors and misalignments (rad) between the axes.
     gyro_range, accelerometer_range : float
         Saturation, rad/s and m/s^2.
+    gyro_bias : float
+        Standard deviation of the biases of the axes, rad/s.
     """
 
     gyro_noise: float = 0.0
@@ -75,6 +77,7 @@ class Limits:
     gyro_misalignment: float = 0.0
     gyro_range: float = math.inf
     accelerometer_range: float = math.inf
+    gyro_bias: float = 0.0
 
 
 def layout(skew: float) -> FloatArray:
@@ -176,7 +179,7 @@ def examine(
     gyro: FloatArray,
     accelerometer: FloatArray,
     parity: FloatArray,
-    limits: tuple[float, float, float, float, float, float],
+    limits: tuple[float, float, float, float, float, float, float],
     pair: bool,
     residual: FloatArray,
 ) -> int:
@@ -208,7 +211,7 @@ def examine(
     int
         n, or fewer: `faults` has changed with the last sample examined.
     """
-    gyro_noise, accelerometer_noise, scale, misalignment, gyro_range, accelerometer_range = limits
+    gyro_noise, accelerometer_noise, scale, misalignment, gyro_range, accelerometer_range, bias = limits
     ring_end = _RING + _WIDTH * _RING_BLOCKS
     for k in range(time.shape[0]):
         t = step[k]
@@ -262,7 +265,7 @@ def examine(
             memory[_FILLED] = min(memory[_FILLED] + 1.0, float(_RING_BLOCKS))
             told = (faults[0] | faults[1] | faults[2] | faults[3]) & 16
             if gyro_noise > 0.0 and memory[_FILLED] >= PARITY_BLOCKS and not told:
-                named = _judge_parity(memory, slot, parity, gyro_noise, scale, misalignment, pair)
+                named = _judge_parity(memory, slot, parity, gyro_noise, bias, scale, misalignment, pair)
                 for axis in range(4):
                     if named & 1 << axis and not faults[axis] & 16:
                         faults[axis] |= 16
@@ -274,7 +277,14 @@ def examine(
 
 @kernel
 def _judge_parity(
-    memory: FloatArray, slot: int, parity: FloatArray, noise: float, scale: float, misalignment: float, pair: bool
+    memory: FloatArray,
+    slot: int,
+    parity: FloatArray,
+    noise: float,
+    bias: float,
+    scale: float,
+    misalignment: float,
+    pair: bool,
 ) -> int:
     """Compare the averaged residual with what is allowed: bits of the axes that may be wrong."""
     time = residual = a = b = c = d = old_a = old_b = old_c = old_d = old_time = 0.0
@@ -289,7 +299,7 @@ def _judge_parity(
             old_a, old_b = old_a + memory[at + 2], old_b + memory[at + 3]
             old_c, old_d = old_c + memory[at + 4], old_d + memory[at + 5]
     scaled = math.sqrt((parity[0] * a) ** 2 + (parity[1] * b) ** 2 + (parity[2] * c) ** 2 + (parity[3] * d) ** 2)
-    turn_on = scale * scaled + misalignment * math.sqrt(a * a + b * b + c * c + d * d)
+    turn_on = bias * time + scale * scaled + misalignment * math.sqrt(a * a + b * b + c * c + d * d)
     if abs(residual) <= PARITY_SIGMAS * noise * math.sqrt(time) + TURN_ON_SIGMAS * turn_on:
         return 0
     if not pair:

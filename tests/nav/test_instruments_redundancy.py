@@ -1,6 +1,7 @@
 """Four axes for three rates: least squares, parity, and the tests that name a failed axis in time and cry no wolf."""
 
 import math
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -46,8 +47,7 @@ def examined(skew, data, limits=LIMITS):
     time, step, gyro, accelerometer = data
     memory, faults, parity = fresh_memory(), np.zeros(7, np.int64), parity_vector(layout(skew))
     residual, found, at = np.zeros(len(time)), [], 0
-    values = (limits.gyro_noise, limits.accelerometer_noise, limits.gyro_scale, limits.gyro_misalignment)
-    values = (*values, limits.gyro_range, limits.accelerometer_range)
+    values = astuple(limits)
     while at < len(time):
         before = faults.copy()
         rest = time[at:], step[at:], gyro[at:], gyro[at:], accelerometer[at:]
@@ -160,6 +160,18 @@ def test_gaps_and_steps_of_zero_raise_no_alarm(skew):
     assert found == []
 
 
+@pytest.mark.parametrize("skew", [0.0, SKEW])
+def test_biases_of_the_grade_are_no_fault(skew):
+    """Turn-on biases far above the noise, as of a MEMS head: a fault unless they are stated; five sigmas of them are one."""
+    time, step, gyro, accelerometer = head(skew, 1.0)
+    sigma = math.radians(0.2)
+    apart = sigma * step[:, None] * parity_vector(layout(skew))
+    stated = replace(LIMITS, gyro_bias=sigma)
+    assert examined(skew, (time, step, gyro + 3.0 * apart, accelerometer))[0]
+    assert not examined(skew, (time, step, gyro + 3.0 * apart, accelerometer), stated)[0]
+    assert examined(skew, (time, step, gyro + 5.0 * apart, accelerometer), stated)[0]
+
+
 @given(st.lists(st.integers(1, 700), max_size=8))
 def test_how_a_stream_is_split_does_not_matter(cuts):
     time, step, gyro, accelerometer = head(0.0, 2.0, 9)
@@ -167,7 +179,7 @@ def test_how_a_stream_is_split_does_not_matter(cuts):
     gyro[1500:, 0] = 0.0
     whole = examined(0.0, (time, step, gyro, accelerometer))
     memory, faults, parity = fresh_memory(), np.zeros(7, np.int64), parity_vector(layout(0.0))
-    values, residual, found = (ARW, VRW, 5e-5, 2.5e-5, 2.0, 200.0), np.zeros(len(time)), []
+    values, residual, found = astuple(LIMITS), np.zeros(len(time)), []
     edges = [0, *np.cumsum(cuts).clip(max=len(time)).tolist(), len(time)]
     at = 0
     for stop in edges[1:]:
