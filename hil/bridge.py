@@ -34,8 +34,9 @@ from hil.scenario import Scenario
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
-from hil.world.instruments import head_model
+from hil.world.instruments import head_model, sensors_of
 from hil.world.truth import TruthKeeper
+from nav.alignment.rest import UNSTATED
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.states import SENSOR_BLOCKS, Block, tuning
@@ -111,29 +112,38 @@ def settings_of(scenario: Scenario) -> Settings:
         lat=math.radians(latitude),
         lon=math.radians(longitude),
         height=motion.height_m if start.height_m is None else start.height_m,
-        alignment="level" if navigation.alignment == "level" else "gyrocompass",
+        alignment="gyrocompass" if navigation.alignment == "truth" else navigation.alignment,
         align_s=navigation.align_s,
         heading=None if start.heading_deg is None else math.radians(start.heading_deg),
+        sensors=UNSTATED if navigation.alignment == "truth" else sensors_of(scenario),
+        sway=navigation.sway_m,
         track_bias_at_rest=navigation.track_bias_at_rest,
         position_trusted=navigation.alignment != "level",
         attitude=navigation.attitude,
         mechanization=navigation.mechanization,
         gravity=navigation.gravity,
         lever_arm=scenario.head.lever_arm_m,
+        antenna=antenna_of(scenario),
         gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
         aiding=aiding_of(scenario, math.radians(latitude), math.radians(longitude)) if navigation.aided else None,
     )
+
+
+def antenna_of(scenario: Scenario) -> tuple[float, float, float]:
+    """From the head to the first receiver's antenna, m."""
+    gnss = scenario.aiding.gnss
+    return _three(np.subtract(gnss[0].lever_arm_m, scenario.head.lever_arm_m) if gnss else np.zeros(3))
 
 
 def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     """How the filter of a scenario is set."""
     head, aiding, height = scenario.head, scenario.aiding, scenario.motion.height_m
     grade = GRADES["dtg" if head.grade == "none" else head.grade]
-    arm = np.subtract(aiding.gnss[0].lever_arm_m, head.lever_arm_m) if aiding.gnss else np.zeros(3)
+    removed = scenario.navigation.alignment not in ("moving", "transfer")
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
     return Aiding(
-        tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=True),
-        FilterSettings(lever_arm=_three(arm), field_n=_three(field_n)),
+        tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=removed),
+        FilterSettings(lever_arm=antenna_of(scenario), field_n=_three(field_n)),
         np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, *np.radians([0.01, 0.01, 0.2])]),
     )
 
