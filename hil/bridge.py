@@ -34,14 +34,15 @@ from hil.scenario import Scenario
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
-from hil.world.instruments import head_model, sensors_of
+from hil.world.instruments import axis_drift, head_model, mounting, sensors_of
 from hil.world.truth import TruthKeeper
 from nav.alignment.rest import UNSTATED
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
-from nav.filter.states import SENSOR_BLOCKS, Block, tuning
+from nav.filter.states import GYRO_BIAS, SENSOR_BLOCKS, Block, tuning
 from nav.gaps import GapPolicy
 from nav.increments import HeadIncrements, ImuIncrements, IntArray
+from nav.instruments.axis_drift import body_drift
 from nav.instruments.grades import GRADES
 from nav.instruments.head import HeadCombiner
 from nav.navigator import Aiding, Navigator, Settings
@@ -141,8 +142,12 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     grade = GRADES["dtg" if head.grade == "none" else head.grade]
     removed = scenario.navigation.alignment not in ("moving", "transfer")
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
+    belief = tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=removed)
+    variances = axis_drift(head, bias_removed=removed)
+    if scenario.driver == "dtg-head" and variances is not None:
+        belief.sigma[GYRO_BIAS] = body_drift(variances, mounting(head), math.radians(head.skew_deg))
     return Aiding(
-        tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=removed),
+        belief,
         FilterSettings(lever_arm=antenna_of(scenario), field_n=_three(field_n)),
         np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, *np.radians([0.01, 0.01, 0.2])]),
     )

@@ -51,9 +51,10 @@ def check_grade(plan: Plan) -> None:
     limit = heading_limit(plan.sensors, plan.lat)
     if plan.way not in ("gyrocompass", "swaying") or limit <= GYROCOMPASS_LIMIT:
         return
+    bias = math.degrees(plan.sensors.gyro_bias) * 3600.0
     found = f"to {math.degrees(limit):.2g} deg only" if limit < 1.0 else "not at all"
     raise AlignmentRefused(
-        f'navigation.alignment = "{plan.way}": a gyro bias of {math.degrees(plan.sensors.gyro_bias) * 3600:.3g} deg/h finds north '
+        f'navigation.alignment = "{plan.way}": a gyro bias of {bias:.3g} deg/h finds north '
         f"{found} at latitude {math.degrees(plan.lat):.1f} deg (bias / (U cos B); {math.degrees(GYROCOMPASS_LIMIT):g} deg are "
         'asked). Give a heading source: navigation.alignment = "level" with navigation.start.heading_deg or a heading sensor, '
         '"moving" with GNSS, or "transfer" from another navigator'

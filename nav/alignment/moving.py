@@ -6,6 +6,7 @@ since then are handed over with the start.
 
 import math
 from bisect import insort
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,18 +17,17 @@ from nav.alignment.held import LATE_S, Held, turn_between
 from nav.alignment.optimization import Misfit, MotionAlignment, TooEarly, mooring
 from nav.alignment.plan import GIVEN_UP, Plan, Start, Word, place_of_sensor
 from nav.alignment.standing import GYROCOMPASS_LIMIT
-from nav.earth import curvature_radii
+from nav.earth import curvature_radii, normal_gravity
 from nav.frames import earth_rate_in_level
 from nav.increments import FloatArray, ImuIncrements, Validity
 from nav.lever_arm import shift
-from nav.rotation import product, quaternion_from_rotation_vector
+from nav.rotation import product, quaternion_from_rotation_vector, rotated
 from nav.state import Health
 
 FEED_S = 1.0
 """Held samples are taken in pieces of this length, s."""
 AGAIN_S = 10.0
 """Time to the next try, s."""
-_G = 9.80665
 
 
 class InMotion:
@@ -55,11 +55,12 @@ class InMotion:
         self._held.drop(len(self._held.rows))
         self._fixes: list[np.void] = []
         self._begun = self._now = self._feed_at = self._ask_at = -math.inf
+        self._progress = 0.0
 
     @property
     def progress(self) -> float:
         """See `Aligner`."""
-        return min(1.0, (self._now - self._begun) / self._plan.align_s) if math.isfinite(self._begun) else 0.0
+        return self._progress
 
     def aid(self, rows: NDArray[np.void]) -> None:
         """See `Aligner`."""
@@ -90,6 +91,7 @@ class InMotion:
         self._now = float(imu.time[start + n - 1])
         if self._now < due:
             return n, None
+        self._progress = min(1.0, (self._now - self._begun) / self._plan.align_s)
         if self._now >= self._ask_at - 1e-9:
             return n, self._asked()
         self._feed_at = self._now + FEED_S
@@ -133,13 +135,13 @@ class InMotion:
             raise TooEarly(f"alignment in motion needs GNSS, and no fix is newer than {LATE_S:g} s: go on")
         fix, rows = there[-1], self._held.rows
         last = int(np.searchsorted(rows.time, fix["time"] - 1e-9))
-        time, rate = float(rows.time[last]), _rate(rows, last)
+        moved = _moved(rows, last)
         self._feed(last + 1)
         result = self._found.result()
-        place, velocity, sigma = _carried(fix, time, rate, result.q_nb, self._plan)
+        place, velocity, sigma = _carried(fix, moved, result.q_nb, self._plan)
         if not np.isfinite(sigma[3:]).all():
             velocity, sigma[3:] = self._found.velocity(result)
-        return self._start(time, place, velocity, sigma, result)
+        return self._start(moved.time, place, velocity, sigma, result)
 
     def _start(
         self, time: float, place: FloatArray, velocity: FloatArray, sigma: FloatArray, result: Alignment
@@ -168,7 +170,7 @@ class Transfer:
     @property
     def progress(self) -> float:
         """See `Aligner`."""
-        return 0.5 * len(self._newest)
+        return 0.0
 
     def aid(self, rows: NDArray[np.void]) -> None:
         """See `Aligner`."""
@@ -198,34 +200,43 @@ class Transfer:
     def _started(self, fix: np.void, attitude: np.void) -> Start:
         rows = self._held.rows
         last = int(np.searchsorted(rows.time, fix["time"] - 1e-9))
-        time, rate = float(rows.time[last]), _rate(rows, last)
-        turned = turn_between(rows, float(attitude["time"]), time)
-        north = -(time - attitude["time"]) * earth_rate_in_level(float(fix["value"][0]))
+        moved = _moved(rows, last)
+        turned = turn_between(rows, float(attitude["time"]), moved.time)
+        north = -(moved.time - attitude["time"]) * earth_rate_in_level(float(fix["value"][0]))
         q_nb = product(quaternion_from_rotation_vector(north), product(attitude["value"][:4], turned))
-        place, velocity, sigma = _carried(fix, time, rate, q_nb, self._plan)
+        place, velocity, sigma = _carried(fix, moved, q_nb, self._plan)
         errors = np.concatenate([sigma, attitude["sigma"][:3]])
         self._held.drop(last + 1)
         remark = _known(float(attitude["sigma"][2]))
-        return Start(time, place, velocity, q_nb, np.zeros(3), errors, 0.0, remark, self._held.rows)
+        return Start(moved.time, place, velocity, q_nb, np.zeros(3), errors, 0.0, remark, self._held.rows)
 
 
-def _carried(
-    fix: np.void, time: float, rate: FloatArray, q_nb: FloatArray, plan: Plan
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Place and velocity of the sensor at `time`, less than a sample after the antenna's fix; sigmas (6,) of both."""
-    after, value, sigma = time - float(fix["time"]), fix["value"], fix["sigma"].copy()
+class _Moved(NamedTuple):
+    """What the body did in a sample: its end, s, rate and specific force, b."""
+
+    time: float
+    rate: FloatArray
+    force: FloatArray
+
+
+def _moved(imu: ImuIncrements, row: int) -> _Moved:
+    step = float(imu.step[row]) or math.inf
+    return _Moved(float(imu.time[row]), imu.dtheta[row] / step, imu.dvel[row] / step)
+
+
+def _carried(fix: np.void, moved: _Moved, q_nb: FloatArray, plan: Plan) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Place and velocity of the sensor at the end of the sample in which the antenna's fix is; sigmas (6,) of both."""
+    after, value = moved.time - float(fix["time"]), fix["value"]
     lat, lon, height, velocity = value[0:1].copy(), value[1:2].copy(), value[2:3].copy(), value[3:].copy()
-    shift(lat, lon, height, velocity.reshape(1, 3), q_nb.reshape(1, 4), rate.reshape(1, 3), -np.array(plan.antenna))
+    arm = -np.array(plan.antenna)
+    shift(lat, lon, height, velocity.reshape(1, 3), q_nb.reshape(1, 4), moved.rate.reshape(1, 3), arm)
     meridian, prime = curvature_radii(math.sin(lat[0]))
     lat += after * velocity[0] / (meridian + height)
     lon += after * velocity[1] / ((prime + height) * np.cos(lat))
     height -= after * velocity[2]
-    sigma[3:] = np.hypot(sigma[3:], after * _G)
-    return np.concatenate([lat, lon, height]), velocity, sigma
-
-
-def _rate(imu: ImuIncrements, row: int) -> FloatArray:
-    return imu.dtheta[row] / imu.step[row] if imu.step[row] > 0.0 else np.zeros(3)
+    velocity += after * rotated(q_nb, moved.force)
+    velocity[2] += after * normal_gravity(math.sin(lat[0]), float(height[0]))
+    return np.concatenate([lat, lon, height]), velocity, fix["sigma"].copy()
 
 
 def _known(sigma_heading: float) -> str:

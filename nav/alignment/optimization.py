@@ -34,6 +34,8 @@ LOOK_S = 1.0
 """Time between looks at a mooring, s: sway within a second is one and the same."""
 FIXES = 4
 """Fewest fixes for an answer."""
+LENGTH = 0.05
+"""The specific force may be so far from what the fixes say, relative; the rest is units."""
 MISFIT = 5.0
 """Residuals may be this many times what fixes and biases explain."""
 RECENT = 60
@@ -207,6 +209,9 @@ class MotionAlignment:
 
     def _refuse_misfit(self, sums: FloatArray, fit: float, gyro: float) -> None:
         """Refuse residuals that nothing explains; the length of the vectors is free: the accelerometers' scale and bias."""
+        length = fit / float(np.trace(sums[_KNOWN, _KNOWN]))
+        if abs(length - 1.0) > LENGTH:
+            raise Misfit(f"specific force is {length:.2g} times what the fixes say: units or signs?")
         left = float(np.trace(sums[_MEASURED, _MEASURED]) - fit**2 / np.trace(sums[_KNOWN, _KNOWN]))
         explained = 3.0 * self._fixes + gyro * float(np.trace(sums[_BY_GYRO, _BY_GYRO]))
         if left > MISFIT**2 * explained:

@@ -126,7 +126,7 @@ class Aligner(Protocol):
 
     @property
     def progress(self) -> float:
-        """How much is done, 0..1."""
+        """How much is done, 0..1; changes with a `Word` or at whole seconds that end `take`, and at no other time."""
 
     def take(self, imu: ImuIncrements, start: int, stop: int) -> tuple[int, Word | None]:
         """Take samples from `start` until there is something to say, before `stop`: how many, and what."""
