@@ -36,17 +36,19 @@ from hil.scenario import Scenario
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
-from hil.world.instruments import head_model
+from hil.world.instruments import axis_drift, head_model, mounting, sensors_of
 from hil.world.truth import TruthKeeper
 from nav.aiding import Kind
+from nav.alignment.rest import UNSTATED
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.assumptions import Assumptions, Bounds
 from nav.filter.record import Recorder
-from nav.filter.states import SENSOR_BLOCKS, Block, Tuning, tuning
+from nav.filter.states import GYRO_BIAS, SENSOR_BLOCKS, Block, Tuning, tuning
 from nav.filter.stillness import Stillness
 from nav.gaps import GapPolicy
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
+from nav.instruments.axis_drift import body_drift
 from nav.instruments.grades import GRADES
 from nav.instruments.head import HeadCombiner
 from nav.navigator import Aiding, Navigator, Settings
@@ -125,18 +127,27 @@ def settings_of(scenario: Scenario) -> Settings:
         lat=math.radians(latitude),
         lon=math.radians(longitude),
         height=motion.height_m if start.height_m is None else start.height_m,
-        alignment="level" if navigation.alignment == "level" else "gyrocompass",
+        alignment="gyrocompass" if navigation.alignment == "truth" else navigation.alignment,
         align_s=navigation.align_s,
         heading=None if start.heading_deg is None else math.radians(start.heading_deg),
+        sensors=UNSTATED if navigation.alignment == "truth" else sensors_of(scenario),
+        sway=navigation.sway_m,
         track_bias_at_rest=navigation.track_bias_at_rest,
         position_trusted=navigation.alignment != "level",
         attitude=navigation.attitude,
         mechanization=navigation.mechanization,
         gravity=navigation.gravity,
         lever_arm=scenario.head.lever_arm_m,
+        antenna=antenna_of(scenario),
         gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
         aiding=aiding_of(scenario, math.radians(latitude), math.radians(longitude)) if navigation.aided else None,
     )
+
+
+def antenna_of(scenario: Scenario) -> tuple[float, float, float]:
+    """From the head to the first receiver's antenna, m."""
+    gnss = scenario.aiding.gnss
+    return _three(np.subtract(gnss[0].lever_arm_m, scenario.head.lever_arm_m) if gnss else np.zeros(3))
 
 
 def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
@@ -149,7 +160,7 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     if chosen.accelerometer_ms_sqrt_h is not None:
         grade = replace(grade, accelerometer_white=chosen.accelerometer_ms_sqrt_h / 60.0)
     tilt = max(math.radians(0.01), grade.accelerometer_bias / 9.80665)
-    arm = np.subtract(aiding.gnss[0].lever_arm_m, head.lever_arm_m) if aiding.gnss else np.zeros(3)
+    removed = scenario.navigation.alignment not in ("moving", "transfer")
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
     if chosen.declination_deg is not None:
         there, level = math.radians(chosen.declination_deg), math.hypot(field_n[0], field_n[1])
@@ -157,18 +168,23 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     believed = tuning(
         grade,
         (*SENSOR_BLOCKS, Block.BAROMETER_BIAS),
-        bias_removed=True,
+        bias_removed=removed,
         barometer=BAROMETER_M,
         barometer_walk=chosen.barometer_m_sqrt_s,
     )
+    variances = axis_drift(head, bias_removed=removed)
+    if scenario.driver == "dtg-head" and variances is not None:
+        believed.sigma[GYRO_BIAS] = body_drift(variances, mounting(head), math.radians(head.skew_deg))
     assumptions = _assumptions_of(scenario, believed)
     if (
         assumptions is not None
-    ):  # what is measured at rest ties the tilt to the accelerometers' biases, which alone are its doubt
+    ):  # what is measured at rest ties the tilt to the accelerometers' biases: they are its doubt
         tilt *= 10.0
     return Aiding(
         believed,
-        FilterSettings(lever_arm=_three(arm), field_n=_three(field_n), magnetic_heading=chosen.magnetic == "heading"),
+        FilterSettings(
+            lever_arm=antenna_of(scenario), field_n=_three(field_n), magnetic_heading=chosen.magnetic == "heading"
+        ),
         np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, tilt, tilt, math.radians(start.heading_sigma_deg)]),
         assumptions,
     )

@@ -304,10 +304,13 @@ class AssumeConfig(_Model):
 class NavigationConfig(_Model):
     """The navigation core."""
 
-    alignment: Literal["gyrocompass", "level", "truth"] = "gyrocompass"
+    alignment: Literal["gyrocompass", "level", "swaying", "moving", "transfer", "truth"] = "gyrocompass"
     """``gyrocompass``: vertical and north from rest; ``level``: vertical from rest, heading given, gyro bias captured;
-    ``truth``: the simulated start, no alignment."""
+    ``swaying``: both from a base that sways in its place; ``moving``: both in motion, with GNSS; ``transfer``: from another
+    navigator's attitude and fix; ``truth``: the simulated start, no alignment."""
     align_s: Annotated[float, Field(ge=0.5, le=3600)] = 30.0
+    sway_m: Positive = 0.3
+    """How far a swaying base moves about its mean place, one sigma an axis."""
     start: StartConfig = StartConfig()
     attitude: str = "two-sample"
     mechanization: str = "geographic"

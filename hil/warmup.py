@@ -16,6 +16,7 @@ Report = Callable[[int], None]
 
 
 def _miniature(scenario: Scenario) -> Scenario:
+    """A second and a half with the sensors of `scenario`, in the way of aligning that any of them can go."""
     head = {**scenario.head.model_dump(), "rate_hz": 200.0}
     return Scenario.model_validate(
         {
@@ -24,7 +25,7 @@ def _miniature(scenario: Scenario) -> Scenario:
             "head": head,
             "aiding": scenario.aiding.model_dump(),
             "motion": {"rest_s": 1.0, "ramp_s": 0.5, "north": {"rate": 1.0}},
-            "navigation": {"align_s": 0.5},
+            "navigation": {"alignment": "level", "align_s": 0.5, "start": {"heading_deg": 0.0}},
         }
     )
 
@@ -53,12 +54,13 @@ def warm_loop(scenario: Scenario, report: Report) -> None:
     chunks = list(SimulatedHead(small).chunks(300))
     report(2)
     outlets = Outlets.make(recording=False, readers=1)
-    loop = Loop(LoopOrder(small), outlets)
-    for _, slow, batch in chunks:
-        if len(slow):
-            loop.take(slow)
-        loop.take(batch)
-        report(3)
+    for chosen in (small, small.with_changes(navigation={"alignment": "moving"})):
+        loop = Loop(LoopOrder(chosen), outlets)
+        for _, slow, batch in chunks:
+            if len(slow):
+                loop.take(slow)
+            loop.take(batch)
+            report(3)
     outlets.states.latest(np.zeros(1, NAV_STATE))
     report(4)
     outlets.frames.push(chunks[0][2])

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nav.alignment import rest
-from nav.alignment.analytic import AlignmentRefused, gyrocompass, level
+from nav.alignment.chain import aligner, check_grade
+from nav.alignment.plan import GIVEN_UP, Plan, Start, Way, Word
+from nav.alignment.rest import UNSTATED, Sensors
 from nav.errors import HilError
-from nav.filter.aided import AidedNavigator
+from nav.filter.aided import AidedNavigator, Answers
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.assumptions import Assumed, Assumptions
 from nav.filter.record import Recorder
@@ -74,32 +76,41 @@ class Settings:
     ----------
     lat, lon, height : float
         Position where alignment takes place, rad and m above the ellipsoid.
-    alignment : {"gyrocompass", "level"}
-        See :mod:`nav.alignment.analytic`; ``level`` needs `heading`.
+    alignment : Way
+        See :mod:`nav.alignment.chain`; ``level`` needs `heading`, or a heading source among the measurements.
     align_s : float
-        Averaging time, s.
+        How long it takes, s.
     heading : float, optional
         Given heading, rad.
+    sensors : Sensors
+        What is known of the sensors in a level vehicle.
+    sway : float
+        How far a swaying base moves about its mean place, one sigma an axis, m.
     track_bias_at_rest : bool
         Keep averaging the gyro bias at rest.
     position_trusted : bool
         False marks the solution `Health.UNAIDED`.
     lever_arm : tuple of float
         From the navigated point to the sensor, body axes, m. What goes in and out is the navigated point.
+    antenna : tuple of float
+        From the sensor to the GNSS antenna, body axes, m; for the alignment in motion.
     """
 
     lat: float = 0.0
     lon: float = 0.0
     height: float = 0.0
-    alignment: Literal["gyrocompass", "level"] = "gyrocompass"
+    alignment: Way = "gyrocompass"
     align_s: float = 30.0
     heading: float | None = None
+    sensors: Sensors = UNSTATED
+    sway: float = 0.3
     track_bias_at_rest: bool = False
     position_trusted: bool = True
     attitude: str = "two-sample"
     mechanization: str = "geographic"
     gravity: str = "normal"
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antenna: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gaps: GapPolicy = field(default_factory=GapPolicy)
     aiding: Aiding | None = None
     """None: measurements besides the inertial ones are not used."""
@@ -122,7 +133,7 @@ class Navigator:
     Raises
     ------
     HilError
-        Unknown method or mechanization, ``level`` without a heading.
+        Unknown method or mechanization; ``level`` without a heading; sensors that cannot find north where they should.
     """
 
     def __init__(self, settings: Settings, recorder: Recorder | None = None) -> None:
@@ -131,18 +142,22 @@ class Navigator:
         self._aided = None if aiding is None else AidedNavigator(self._core, aiding.tuning, aiding.filter, recorder)
         self._watch = None if self._aided is None else Watch(self._aided)
         self._assumed = None if aiding is None or aiding.assumptions is None else Assumed(aiding.assumptions)
-        if settings.alignment == "level" and settings.heading is None:
-            raise HilError('alignment "level" needs a heading: give navigation.start.heading_deg')
+        if settings.alignment == "level" and settings.heading is None and aiding is None:
+            raise HilError(
+                'alignment "level" needs a heading: give navigation.start.heading_deg, or a heading sensor and navigation.aided'
+            )
+        self._plan = _plan(settings)
+        check_grade(self._plan)
         self.settings = settings
         self.mode = Mode.INIT
         self.health = Health.GOOD if settings.position_trusted else Health.UNAIDED
         self.gyro_bias = np.zeros(3)
-        self.heading = settings.heading
         self._flagged = 0
         self._filler = GapFiller(settings.gaps)
         self._sums = np.zeros(rest.SUMS)
         self._state = _solution(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
         self._arm = np.asarray(settings.lever_arm, float)
+        self._aligner = aligner(self._plan, self._state[:3])
         self._progress = 0.0
         self._events: list[Event] = []
         self._rows = np.zeros(256, NAV_STATE)
@@ -169,7 +184,7 @@ class Navigator:
         """
         self._state = _solution(lat, lon, height, vel_n, q_nb)
         self._move(1.0, w_ib_b)
-        self._start_core(time, 0.0, 0.0)
+        self._start_core(time, np.zeros(9))
         self._sums[:] = 0.0
         self._progress = 1.0
         self.tell(time, "info", "navigating from a given start")
@@ -178,24 +193,31 @@ class Navigator:
     def realign(self, time: float, reason: str) -> None:
         """Give the attitude up and align again at the present position."""
         self.mode = Mode.ALIGN
-        self.health &= ~(Health.BRIDGED | Health.MOVING | Health.UNITS | Health.RATE_TOO_SMALL)
+        self.health &= ~(Health.BRIDGED | GIVEN_UP)
         self._sums[:] = 0.0
         self._progress = 0.0
         if self._state[6:10].any():
             self._move(-1.0)
         lat, lon, height = self._state[:3]
         self._state = _solution(lat, lon, height, np.zeros(3), np.zeros(4))
+        self._aligner = aligner(self._plan, self._state[:3])
         self.tell(time, "notice", f"aligning: {reason}")
 
     def aid(self, rows: NDArray[Any]) -> None:
-        """Take measurements (:data:`nav.aiding.AIDING`); those that come before the navigation has begun are not used.
+        """Take measurements (:data:`nav.aiding.AIDING`): for the alignment, then for the filter, if there is one.
 
         Raises
         ------
         HilError
             A value or a standard deviation that is used is no number.
         """
-        if self._aided is not None and self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
+        if self.mode == Mode.ALIGN:
+            if not (
+                np.isfinite(rows["time"]).all() and np.isfinite(rows["value"]).all() and (rows["sigma"] > 0.0).all()
+            ):
+                raise HilError("aiding row: a value is no number, or a sigma is not positive: mend what sends it")
+            self._aligner.aid(rows)
+        elif self._aided is not None and self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
             self._aided.aid(rows)
             for restart in self._aided.restarts():
                 text = "the filter had diverged: it starts again where GNSS says"
@@ -229,7 +251,7 @@ class Navigator:
         rows = self._room(n)
         rows["time"], rows["sequence"] = imu.time, imu.sequence
         if self.mode == Mode.INIT:
-            self.realign(float(imu.time[0]), f"stand still for {self.settings.align_s:g} s")
+            self.realign(float(imu.time[0]), self._plan.order)
         if self.health & Health.SILENT:
             self.health &= ~Health.SILENT
             self.tell(float(imu.time[0]), "notice", "samples arrive again")
@@ -260,13 +282,12 @@ class Navigator:
         rate = np.zeros((1, 3)) if w_ib_b is None else np.asarray(w_ib_b, float).reshape(1, 3)
         shift(lat, lon, height, vel_n.reshape(1, 3), q_nb.reshape(1, 4), rate, sign * self._arm)
 
-    def _start_core(self, time: float, sigma_tilt: float, sigma_heading: float) -> None:
+    def _start_core(self, time: float, sigma: FloatArray) -> None:
         lat, lon, height = self._state[:3]
         if self._aided is None or self.settings.aiding is None:
             self._core.start(lat, lon, height, self._state[3:6], self._state[6:10])
             return
-        sigma = self.settings.aiding.sigma.copy()
-        sigma[6:9] = np.maximum(sigma[6:9], [sigma_tilt, sigma_tilt, sigma_heading])
+        sigma = np.maximum(self.settings.aiding.sigma, sigma)
         self._aided.start(time, lat, lon, height, self._state[3:6], self._state[6:10], sigma, self.gyro_bias)
         if self._watch is not None:
             self._watch.start()
@@ -293,52 +314,38 @@ class Navigator:
             start += (self._align if self.mode == Mode.ALIGN else self._navigate)(imu, rows, start, end)
 
     def _align(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
-        goal = self.settings.align_s
-        used, event = rest.accumulate(
-            self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], goal
-        )
+        used, word = self._aligner.take(imu, start, stop)
         last = start + used - 1
-        self._fill_constant(rows[start:last])  # what a block brings shows from its last sample on
-        time = float(imu.time[last])
-        if event == 3:
-            self._complain(time, Health.MOVING, "alignment waits: the vehicle moves")
-        elif event:
-            self._judge(time, event == 2)
-        self._progress = rest.progress(self._sums, goal) if self.mode == Mode.ALIGN else 1.0
+        self._fill_constant(rows[start:last])  # what a sample brings shows from it on
+        if word is not None:
+            self._hear(float(imu.time[last]), word)
+        self._progress = self._aligner.progress if self.mode == Mode.ALIGN else 1.0
         self._fill_constant(rows[last : last + 1])
         return used
 
-    def _judge(self, time: float, complete: bool) -> None:
-        mean = rest.means(self._sums)
-        wrong = rest.gravity_verdict(mean.f)
-        if wrong:
-            self._complain(time, Health.UNITS, wrong)
-        self.health &= ~Health.MOVING
-        if not complete:
-            return
-        lat = float(self._state[0])
-        try:
-            if self.settings.alignment == "level":
-                result = level(mean, lat, self.heading or 0.0)
-            else:
-                result = gyrocompass(mean, lat)
-        except AlignmentRefused as refusal:
-            self._complain(time, Health.UNITS if wrong else Health.RATE_TOO_SMALL, str(refusal))
-            self._sums[:] = 0.0
-            return
-        self.health &= ~(Health.UNITS | Health.RATE_TOO_SMALL)
-        self.gyro_bias = result.gyro_bias
+    def _hear(self, time: float, word: Word) -> None:
+        for health, text in word.complaints:
+            self._complain(time, health, text)
+        self.health &= ~word.cleared
+        if word.notice:
+            self.tell(time, "notice", word.notice)
+        if word.start is not None:
+            self._begin_at(time, word.start)
+
+    def _begin_at(self, time: float, start: Start) -> None:
+        """Navigate from the end of the alignment, which may lie some samples back."""
+        self.gyro_bias = start.gyro_bias
         self._sums[:] = 0.0
-        self._state[6:10] = result.q_nb
-        self._move(1.0)
-        self._start_core(time, result.sigma_tilt, result.sigma_heading)
+        self._state = np.concatenate([start.place, start.vel_n, start.q_nb])
+        self._start_core(start.time, start.sigma)
         self.mode = Mode.NAVIGATE
-        heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(result.q_nb))
+        if len(start.since):
+            self._advance(start.since)
+        heading, pitch, roll = (math.degrees(angle) for angle in euler_from_quaternion(self._state[6:10]))
         self.tell(
             time,
             "info",
-            f"aligned in {mean.time_s:.1f} s: heading {heading:.3f} pitch {pitch:.3f} roll {roll:.3f} deg, "
-            f"{np.linalg.norm(mean.f) / 9.80665:.3f} g",
+            f"aligned in {start.took_s:.1f} s: heading {heading:.3f} pitch {pitch:.3f} roll {roll:.3f} deg, {start.remark}",
         )
         self._trust(time)
 
@@ -355,30 +362,7 @@ class Navigator:
                 self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], REST_WINDOW_S
             )
             stop = start + used
-        n = stop - start
-        position, velocity, attitude = (array[:n] for array in self._scratch)
-        before = self._core.mechanization
-        if self._aided is None:
-            done = self._core.advance(
-                imu.step[start:stop],
-                imu.dtheta[start:stop],
-                imu.dvel[start:stop],
-                self.gyro_bias,
-                position,
-                velocity,
-                attitude,
-            )
-        else:
-            position, velocity, attitude = self._aided.process(imu.rows(start, stop))
-            self.gyro_bias = self._aided.estimates[GYRO_BIAS].copy()
-            done = n if self._core.mechanization == before else 0
-        self._state[:] = self._core.solution
-        if done < n:
-            self.tell(
-                float(imu.time[start + done]),
-                "notice",
-                f"the {before} mechanization is singular at the pole: {self._core.mechanization} goes on",
-            )
+        position, velocity, attitude = self._advance(imu.rows(start, stop))
         part = rows[start:stop]
         part["mode"], part["health"] = self.mode, self.health
         part["lat"], part["lon"], part["height"] = position[:, 0], position[:, 1], position[:, 2]
@@ -389,7 +373,24 @@ class Navigator:
             self._track_bias()
         if self._assumed is not None and self._aided is not None and self._assumed.detector.decided:
             self.aid(self._assumed.rows(self._aided))
-        return n
+        return stop - start
+
+    def _advance(self, imu: ImuIncrements) -> Answers:
+        """Carry the solution over samples: place, velocity, attitude at each, valid until the next call."""
+        n, before = len(imu), self._core.mechanization
+        if self._aided is None:
+            self._room(n)
+            position, velocity, attitude = out = Answers(*(array[:n] for array in self._scratch))
+            done = self._core.advance(imu.step, imu.dtheta, imu.dvel, self.gyro_bias, position, velocity, attitude)
+        else:
+            out = self._aided.process(imu)
+            self.gyro_bias = self._aided.estimates[GYRO_BIAS].copy()
+            done = n if self._core.mechanization == before else 0
+        self._state[:] = self._core.solution
+        if done < n:
+            text = f"the {before} mechanization is singular at the pole: {self._core.mechanization} goes on"
+            self.tell(float(imu.time[done]), "notice", text)
+        return out
 
     def _flag(self, time: float, flagged: int) -> None:
         if flagged & ~self._flagged & Validity.SENSOR:
@@ -408,7 +409,7 @@ class Navigator:
             self.gyro_bias = self.gyro_bias + REST_GAIN * change
 
     def _meet(self, gap: Gap) -> None:
-        if self.mode in (Mode.INIT, Mode.ALIGN):
+        if self.mode == Mode.INIT or (self.mode == Mode.ALIGN and not (gap.realign and self._plan.in_motion)):
             return
         what = f"gap of {gap.length_s:.3f} s, {gap.missing} samples"
         if gap.length_s < 0.0:
@@ -446,6 +447,21 @@ class Navigator:
         part["sigma"], part["test_ratio"] = np.inf, 0.0
         if self._watch is not None and self.mode >= Mode.NAVIGATE:
             part["sigma"], part["test_ratio"] = self._watch.sigma, self._watch.ratio
+
+
+def _plan(settings: Settings) -> Plan:
+    return Plan(
+        settings.alignment,
+        settings.lat,
+        settings.lon,
+        settings.height,
+        settings.align_s,
+        settings.heading,
+        settings.sensors,
+        settings.sway,
+        settings.lever_arm,
+        settings.antenna,
+    )
 
 
 def _solution(lat: float, lon: float, height: float, vel_n: FloatArray, q_nb: FloatArray) -> FloatArray:

@@ -17,9 +17,11 @@ from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from hil.calibration import CalibrationFile, rotor_of
 from hil.scenario import HeadConfig, Scenario
 from hil.world.motion import Motion
+from nav.alignment.rest import UNSTATED, Sensors
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerometers
+from nav.instruments.axis_drift import axis_variances, body_drift
 from nav.instruments.calibration import CASES
 from nav.instruments.dtg import move, step_map
 from nav.instruments.grades import GRADES
@@ -37,6 +39,7 @@ BLOCK_OFFSET_M = 0.03
 """How far the level pendulums' hinges of the simulated block lie out of its centre."""
 GYRO_RANGE = math.radians(180.0)
 """The torquers saturate here, rad/s."""
+_G = 9.80665
 _TURN_ON = ("gyro_bias", "gyro_scale", "gyro_misalignment", "gyro_g", "accelerometer_bias", "accelerometer_scale")
 
 
@@ -91,7 +94,32 @@ def head_model(head: HeadConfig) -> HeadModel:
         block_of(head),
         limits_of(head),
         calibration,
+        axis_drift(head),
     )
+
+
+def axis_drift(head: HeadConfig, *, bias_removed: bool = False) -> FloatArray | None:
+    """Variances of the drift of the four gyro axes of the scenario's grade, (rad/s)^2; None where there is no grade."""
+    if head.grade == "none":
+        return None
+    factor = max(head.errors_factor, 1.0) if head.calibration is None else 1.0
+    return axis_variances(GRADES[head.grade], mounting(head), bias_removed=bias_removed, factor=factor)
+
+
+def sensors_of(scenario: Scenario) -> Sensors:
+    """What an alignment is told of the sensors of a scenario, in a level vehicle."""
+    head = scenario.head
+    variances = axis_drift(head)
+    if variances is None:
+        return UNSTATED
+    grade = GRADES[head.grade]
+    by_gravity = grade.gyro_g * _G
+    drift = np.full(3, math.hypot(grade.gyro_bias, by_gravity, grade.gyro_flicker))
+    if scenario.driver == "dtg-head":
+        drift = body_drift(variances, mounting(head), math.radians(head.skew_deg))
+    level = float(drift[:2].max())
+    upright = math.sqrt(max(0.0, float(drift[2]) ** 2 - level**2))
+    return Sensors(grade.gyro_white, grade.accelerometer_white, level, grade.accelerometer_bias, upright)
 
 
 def limits_of(head: HeadConfig) -> Limits:

@@ -14,9 +14,10 @@ On a swaying base the fixes are the mooring itself, wrong by the sway: gravity, 
 """
 
 import math
+from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from nav.aiding import AIDING, Kind
 from nav.alignment import vectors
@@ -33,8 +34,12 @@ LOOK_S = 1.0
 """Time between looks at a mooring, s: sway within a second is one and the same."""
 FIXES = 4
 """Fewest fixes for an answer."""
+LENGTH = 0.05
+"""The specific force may be so far from what the fixes say, relative; the rest is units."""
 MISFIT = 5.0
 """Residuals may be this many times what fixes and biases explain."""
+RECENT = 60
+"""Newest fixes that the velocity is fitted to."""
 NOISE_AS_BIAS = 2100.0 / 1287.0
 """A white noise N of the rate turns the heading as a bias of the variance N^2 / T times this: integral of the squared
 weight that the rate has on a swaying base, 140 s^3 (1 - s)^3."""
@@ -42,6 +47,14 @@ weight that the rate has on a swaying base, 140 s^3 (1 - s)^3."""
 _MEASURED, _KNOWN, _FREE, _BY_GYRO, _BY_FORCE = slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 17), slice(17, 26)
 _ROW = 26
 """A row of the least squares: gamma, delta, (1, t), derivatives of gamma by both biases; or the rates of all these."""
+
+
+class TooEarly(AlignmentRefused):
+    """More of the same would do."""
+
+
+class Misfit(AlignmentRefused):
+    """The samples and the fixes are not of one motion."""
 
 
 class MotionAlignment:
@@ -53,17 +66,22 @@ class MotionAlignment:
         For covariance and refusals.
     asked : float
         Standard deviation of the heading that is needed, rad.
+    arm_b : (3,) float
+        From the sensor to what the fixes are of (an antenna), b, m.
     """
 
-    def __init__(self, sensors: Sensors = UNSTATED, asked: float = math.inf) -> None:
-        self._sensors, self._asked = sensors, asked
+    def __init__(
+        self, sensors: Sensors = UNSTATED, asked: float = math.inf, arm_b: ArrayLike = (0.0, 0.0, 0.0)
+    ) -> None:
+        self._sensors, self._asked, self._arm = sensors, asked, np.array(arm_b, float)
         self._memory, self._body = np.zeros(MEMORY), np.zeros(vectors.STATE)
         self._body[0] = 1.0
         self._sums = np.zeros((_ROW, _ROW))
         self._pending = np.zeros(0, AIDING)
         self._start = self._time = -math.inf
-        self._fixes, self._fix_time, self._place = 0, 0.0, (0.0, 0.0)
+        self._fixes, self._fix_time, self._place, self._height = 0, 0.0, (0.0, 0.0), 0.0
         self._origin, self._pull, self._fallen_speed, self._fallen = np.zeros((4, 3))
+        self._recent: deque[tuple[float, float, FloatArray, FloatArray]] = deque(maxlen=RECENT)
 
     def add(self, imu: ImuIncrements, fixes: NDArray[np.void]) -> None:
         """Take samples, one or many, and fixes of their time or of later ones.
@@ -97,7 +115,8 @@ class MotionAlignment:
             vectors.carry(self._body, imu.step[done : end + 1], *(part[done : end + 1] for part in integrals))
             done = int(end) + 1
             if fix["time"] >= self._start:
-                self._take(fix, float(imu.time[end] - fix["time"]))
+                rate = imu.dtheta[end] / imu.step[end] if imu.step[end] > 0.0 else np.zeros(3)
+                self._take(fix, float(imu.time[end] - fix["time"]), rate)
         vectors.carry(self._body, imu.step[done:], *(part[done:] for part in integrals))
         self._pending = waiting[ends == n]
         if n:
@@ -124,11 +143,11 @@ class MotionAlignment:
             neither fixes nor biases explain.
         """
         if self._fixes < FIXES:
-            raise AlignmentRefused(f"alignment in motion needs {FIXES} fixes and has {self._fixes}: go on")
+            raise TooEarly(f"alignment in motion needs {FIXES} fixes and has {self._fixes}: go on")
         sums, s = self._reduced(), self._sensors
         known = sums[_KNOWN, _KNOWN]
         if self.observability < 1e-6:
-            raise AlignmentRefused("too little is seen: all vectors are parallel; go on, or turn the vehicle")
+            raise TooEarly("too little is seen: all vectors are parallel; go on, or turn the vehicle")
         q_ib0, fit = davenport(sums[_KNOWN, _MEASURED])
         by_fix = np.linalg.inv(np.trace(known) * np.eye(3) - known)
         c_ib0 = dcm_from_quaternion(q_ib0)
@@ -146,6 +165,34 @@ class MotionAlignment:
         self._refuse_heading(math.sqrt(covariance[2, 2]), math.sqrt(bias[2, 2]))
         return Alignment(product(q_ni, product(q_ib0, self._body[vectors.Q])), np.zeros(3), covariance)
 
+    def velocity(self, result: Alignment) -> tuple[FloatArray, float]:
+        """Velocity of the sensor at the last sample, from the places of the newest fixes.
+
+        Parameters
+        ----------
+        result : Alignment
+            What `result` has answered there.
+
+        Returns
+        -------
+        vel_n : (3,) float
+            North, east, down, m/s.
+        sigma : float
+            Of each, m/s: places, and the tilt in which gravity is taken.
+        """
+        time, sigma, gamma, known = (np.array(column) for column in zip(*self._recent, strict=True))
+        q_ni = conjugate(product(_turned(self.time_s), level_in_earth(*self._place)))
+        q_ib0 = product(product(conjugate(q_ni), result.q_nb), conjugate(self._body[vectors.Q]))
+        span = float(time[-1] - time[0])
+        slope = np.polyfit(time - time[-1], known - rotated(q_ib0, gamma), 1, w=1.0 / sigma)[0]
+        fallen = self._fallen_speed + (self.time_s - self._fix_time) * self._pull
+        speed = fallen + rotated(q_ib0, self._body[vectors.ALPHA]) + slope
+        here = np.zeros(1, AIDING)[0]
+        here["value"][:3] = (*self._place, self._height)
+        vel_n = rotated(q_ni, speed - _inertial(here, self.time_s)[1])
+        by_place = math.sqrt(12.0 / float((sigma**-2.0).sum())) / span
+        return vel_n, math.hypot(by_place, 0.5 * span * 9.8 * result.sigma_tilt)
+
     def _refuse_heading(self, sigma: float, by_bias: float) -> None:
         asked = min(self._asked, 1.0 / SIGMAS)
         if sigma <= asked:
@@ -156,16 +203,19 @@ class MotionAlignment:
                 f"the sensors are too noisy: {text}, and their biases alone leave {math.degrees(by_bias):.3g} deg after "
                 f"{self.time_s:.0f} s; give a heading, or turn the vehicle where fixes see it"
             )
-        raise AlignmentRefused(
+        raise TooEarly(
             f"too little is seen in {self.time_s:.0f} s: {text} (observability {self.observability:.2g}); go on"
         )
 
     def _refuse_misfit(self, sums: FloatArray, fit: float, gyro: float) -> None:
         """Refuse residuals that nothing explains; the length of the vectors is free: the accelerometers' scale and bias."""
+        length = fit / float(np.trace(sums[_KNOWN, _KNOWN]))
+        if abs(length - 1.0) > LENGTH:
+            raise Misfit(f"specific force is {length:.2g} times what the fixes say: units or signs?")
         left = float(np.trace(sums[_MEASURED, _MEASURED]) - fit**2 / np.trace(sums[_KNOWN, _KNOWN]))
         explained = 3.0 * self._fixes + gyro * float(np.trace(sums[_BY_GYRO, _BY_GYRO]))
         if left > MISFIT**2 * explained:
-            raise AlignmentRefused(
+            raise Misfit(
                 f"the motion does not fit the fixes: residuals are {math.sqrt(left / explained):.0f} times what their sigmas "
                 "and the sensors' biases explain; mend the sigmas, the place or the axes"
             )
@@ -184,8 +234,8 @@ class MotionAlignment:
                 )
             before = time
 
-    def _take(self, fix: NDArray[np.void], before: float) -> None:
-        """Add a fix that was true `before` s earlier than the last sample."""
+    def _take(self, fix: NDArray[np.void], before: float, rate: FloatArray) -> None:
+        """Add a fix that was true `before` s earlier than the last sample, which turns at `rate`."""
         time = float(fix["time"]) - self._start
         place, speed, pull = _inertial(fix, time)
         if self._fixes == 0:
@@ -195,13 +245,20 @@ class MotionAlignment:
             self._fallen = self._fallen + h * self._fallen_speed + h * h * (self._pull / 3.0 + pull / 6.0)
             self._fallen_speed = self._fallen_speed + 0.5 * h * (self._pull + pull)
         self._fixes, self._fix_time, self._pull = self._fixes + 1, time, pull
-        self._place = float(fix["value"][0]), float(fix["value"][1])
+        self._place, self._height = (float(fix["value"][0]), float(fix["value"][1])), float(fix["value"][2])
         body = self._body
         alpha = body[vectors.ALPHA] - before * body[vectors.MEAN]
         gamma = body[vectors.GAMMA] - before * body[vectors.ALPHA] + 0.5 * before**2 * body[vectors.MEAN]
+        if self._arm.any():  # the fix is of the end of a lever that turns with the body
+            swept = np.cross(rate, self._arm)
+            gamma = gamma + rotated(body[vectors.Q], self._arm - before * swept)
+            alpha = alpha + rotated(body[vectors.Q], swept)
         by_place = body[vectors.GAMMA_BY_GYRO], body[vectors.GAMMA_BY_FORCE]
         by_speed = body[vectors.ALPHA_BY_GYRO], body[vectors.ALPHA_BY_FORCE]
-        self._weigh(fix["sigma"][:3], gamma, place - self._origin - self._fallen, (1.0, time), *by_place)
+        known = place - self._origin - self._fallen
+        sigma = math.sqrt(float((fix["sigma"][:3] ** 2).mean()))
+        self._recent.append((time, sigma, gamma, known))
+        self._weigh(fix["sigma"][:3], gamma, known, (1.0, time), *by_place)
         self._weigh(fix["sigma"][3:], alpha, speed - self._fallen_speed, (0.0, 1.0), *by_speed)
 
     def _weigh(self, sigma: FloatArray, *parts: FloatArray | tuple[float, float]) -> None:

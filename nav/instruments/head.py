@@ -49,6 +49,9 @@ class HeadModel:
         What healthy instruments do.
     calibration : Calibration, optional
         Measured errors of the instruments, taken off; its rotors, if it has any, take the place of `rotors`.
+    variances : (4,) float, optional
+        How well each gyro axis is known (:func:`nav.instruments.axis_drift.axis_variances`); their ratios are the weights of
+        the combination. None: all alike.
     """
 
     c_bh: FloatArray
@@ -57,6 +60,7 @@ class HeadModel:
     pendulums: Sequence[Pendulum] = ()
     limits: Limits = field(default_factory=Limits)
     calibration: Calibration | None = None
+    variances: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +112,7 @@ class HeadCombiner:
         self._c_bh = np.ascontiguousarray(model.c_bh, dtype=float)
         calibration = self._calibration = model.calibration
         self._h = redundancy.layout(model.skew) if calibration is None else calibration.gyro_matrix(model.skew)
+        self._weights = np.ones(4) if model.variances is None else model.variances.max() / model.variances
         self._calibrator = None if calibration is None else Calibrator(calibration, model.skew)
         self._outside = False
         self._pair = math.sin(model.skew) == 0.0
@@ -228,7 +233,7 @@ class HeadCombiner:
         doubt = bool((suspects & ~lost).sum() > 1)
         if not doubt:
             lost |= suspects
-        inverse = redundancy.combination(self._h, np.where(lost, 0.0, 1.0))
+        inverse = redundancy.combination(self._h, np.where(lost, 0.0, self._weights))
         bad = inverse is None or doubt or bool((self.faults[4:] & _LOST.value).any())
         self._flag = int(Validity.SENSOR) if bad else int(Validity.SPARE) if lost.any() else 0
         if inverse is None:  # better a bad measurement than none; a dead one is none

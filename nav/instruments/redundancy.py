@@ -241,7 +241,7 @@ def examine(
                 base = axis * _AXIS
                 if block:
                     allowed = NOISE_LIMIT * NOISE_LIMIT * _DIFFERENCE_GAIN * noise * noise
-                    if memory[base + _SQUARES] > allowed * memory[base + _COUNT]:
+                    if memory[base + _SQUARES] > allowed * max(memory[base + _COUNT], 0.0):
                         fault |= 2
                     memory[base + _SQUARES], memory[base + _COUNT] = 0.0, min(memory[base + _COUNT], 0.0)
             if abs(value) > largest * t:

@@ -136,6 +136,17 @@ def test_own_signal_tests_find_it_in_two_hundred_milliseconds(axis, kind):
     assert {name for _, name, fault in found if fault & (Fault.STUCK | Fault.NOISE)} == {AXES[axis]}
 
 
+def test_a_slow_head_is_not_noisy_before_the_sixth_difference_is_there():
+    """At 100 Hz the first block of the noise test ends with its fifth sample."""
+    n, step = 200, 0.01
+    rng = np.random.default_rng(8)
+    gyro = ARW * math.sqrt(step) * rng.standard_normal((n, 4))
+    accelerometer = VRW * math.sqrt(step) * rng.standard_normal((n, 3))
+    found, faults = examined(0.0, (step * np.arange(1, n + 1), np.full(n, step), gyro, accelerometer))
+    assert found == []
+    assert not faults.any()
+
+
 def test_saturation_comes_and_goes():
     time, _, gyro, _ = data = head(0.0, 2.0)
     gyro[(time > 1.0) & (time < 1.1), 3] = 2.1 * STEP

@@ -12,7 +12,9 @@ from nav.earth import curvature_radii
 from nav.filter.gnss_attitude import GnssAttitude, attitude
 from nav.frames import level_in_earth
 from nav.increments import FloatArray, ImuIncrements
+from nav.instruments import redundancy
 from nav.instruments.accelerometer_errors import Accelerometers
+from nav.instruments.axis_drift import axis_variances
 from nav.instruments.grades import Grade
 from nav.instruments.gyro_errors import DTG_HEAD, Gyros
 from nav.instruments.sources import combination
@@ -26,15 +28,22 @@ FIX_S, PLACE_M, SPEED = 0.2, 1.5, 0.1
 PHASE_M, WAVELENGTH_M = 5e-3, 0.1903
 ANTENNAS_B = np.array([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, -2.0, 0.0], [0.0, 0.0, 0.0]])
 """Nose, right, left, middle: three baselines of 2 m in a plane."""
-UPRIGHT = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""Axes of a level head for alignment: both level ones from the gyro whose rotor stands upright, so that gravity, along its
-spin, does not drift it."""
+
+
+def weighted(grade: Grade) -> FloatArray:
+    """(3, c): combination of the gyros' channels; those of a level head by what gravity drifts of each, as the product does."""
+    if grade.gyro_channels != DTG_HEAD:
+        return combination(grade.gyro_channels)
+    variances = axis_variances(grade, np.eye(3), bias_removed=True)
+    best = redundancy.combination(redundancy.layout(0.0), 1.0 / variances)
+    assert best is not None  # four axes with weights span space
+    return best
 
 
 def sensors(grade: Grade) -> Sensors:
     """What an alignment is told of a level unit whose gyro bias has been removed at rest.
 
-    Gravity drifts the level gyros like a bias, but for those of a head, see `UPRIGHT`.
+    Gravity drifts the level gyros like a bias, but for those of a head, see `weighted`.
     """
     by_gravity = grade.gyro_g * GRAVITY
     level = 0.0 if grade.gyro_channels == DTG_HEAD else by_gravity
@@ -58,11 +67,11 @@ def ideal(motion: Motion, duration: float) -> tuple[FloatArray, FloatArray]:
 def sensed(
     true: tuple[FloatArray, FloatArray], grade: Grade, seed: int, to_body: FloatArray | None = None
 ) -> ImuIncrements:
-    """The same as instruments of a grade give it, drawn by the seed; `to_body` (3, c) combines the gyros' channels."""
+    """The same as instruments of a grade give it, drawn by the seed; `to_body` (3, c) in place of `weighted`."""
     turn_on, gyro_noise, force_noise = np.random.default_rng([seed, 5]).spawn(3)
     gyros, forces = grade.draw(turn_on, bias_removed=True)
-    if to_body is None or grade.gyro_channels != DTG_HEAD:
-        to_body = combination(grade.gyro_channels)
+    if to_body is None:
+        to_body = weighted(grade)
     imu = ImuIncrements.empty(len(true[0]))
     imu.sequence[:] = np.arange(len(imu))
     imu.step[:], imu.time[:] = STEP, STEP * (imu.sequence + 1)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hil.scenario import Channel, MotionConfig, Sine
-from hil.study.alignment.records import UPRIGHT, ideal, sensed, sensors
+from hil.study.alignment.records import ideal, sensed, sensors
 from hil.study.report import Line, Plot, Row, at_most, near, shown
 from hil.world.motion import Motion
 from nav.alignment.analytic import Alignment, AlignmentRefused
@@ -18,6 +18,7 @@ from nav.alignment.recursive import RestAlignment
 from nav.earth import RATE
 from nav.increments import FloatArray, ImuIncrements
 from nav.instruments.grades import GRADES
+from nav.instruments.sources import combination
 from nav.rotation import attitude_error
 
 LAT_DEG, HEIGHT_M, SWAY_M = 50.0, 20.0, 0.3
@@ -116,7 +117,7 @@ def stand(heading_deg: float) -> MotionConfig:
     return MotionConfig(latitude_deg=LAT_DEG, height_m=HEIGHT_M, heading=Channel(offset=heading_deg))
 
 
-def aligned(name: str, seeds: int, duration: float, *, swaying: bool, to_body: FloatArray | None = UPRIGHT) -> Answers:
+def aligned(name: str, seeds: int, duration: float, *, swaying: bool, to_body: FloatArray | None = None) -> Answers:
     """Alignments of a grade, each at a heading of its own."""
     grade, lat = GRADES[name], LAT_DEG * DEG
 
@@ -182,8 +183,8 @@ def standing(seeds: int, duration: float) -> tuple[list[Row], list[Plot]]:
         plots.append(curves(key, f"Heading of the alignment {words}, latitude {LAT_DEG:g} deg", found))
         if key == "sway":
             rows += _goal(found["dtg"], seeds, duration)
-    halves = aligned("dtg", seeds, duration, swaying=True, to_body=None)
-    what = "DTG head, swaying, both y channels averaged: the upright rotor's and one that gravity drifts"
+    halves = aligned("dtg", seeds, duration, swaying=True, to_body=combination(GRADES["dtg"].gyro_channels))
+    what = "DTG head, swaying, both y channels alike: the upright rotor's and one that gravity drifts"
     rows += described("sway-dtg-halves", what, halves)
     return rows, plots
 

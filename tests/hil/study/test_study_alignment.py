@@ -7,6 +7,7 @@ import pytest
 
 from hil.study import study_names
 from hil.study.alignment import run
+from hil.study.alignment.fine import moored
 from hil.study.alignment.flying import epochs, flown
 from hil.study.alignment.records import FIX_S, fixes, ideal, sensed
 from hil.study.alignment.standing import Answers
@@ -20,7 +21,7 @@ def test_every_limit_is_kept():
 
 
 def test_rows_and_figures():
-    found = run(seeds=2, duration=60.0, flights=2, flight_s=20.0, tracked=1, tracked_s=10.0)
+    found = run(seeds=2, duration=60.0, flights=2, flight_s=20.0, tracked=1, tracked_s=10.0, refined_s=80.0)
     ids = [row.id for row in found.rows]
     assert len(set(ids)) == len(ids)
     assert {
@@ -29,12 +30,24 @@ def test_rows_and_figures():
         "sway-mems-answers",
         "flight-dtg-heading",
         "track-20-mems-tilt",
+        "fine-flight-tactical-heading",
     } <= set(ids)
     rows = {row.id: row for row in found.rows}
     assert rows["rest-mems-answers"].ok
     assert "gyro bias" in rows["rest-mems-answers"].what
-    assert {plot.id for plot in found.plots} == {"rest", "sway", "flight", "track-dtg", "track-tactical", "track-mems"}
+    assert {plot.id for plot in found.plots} == {
+        *("rest", "sway", "flight", "fine"),
+        *("track-dtg", "track-tactical", "track-mems"),
+    }
     assert "alignment" in study_names()
+
+
+def test_the_filter_goes_on_where_the_coarse_alignment_ends():
+    """From a heading of the wrong minute's sway to that of theory: the filter's error is within its sigma, and below before."""
+    found = moored("dtg", 1, 300.0)
+    heading, sigma = np.abs(found.errors[0, :, 1]), found.sigmas[0, :, 1]
+    assert sigma[-1] < 0.002 < sigma[6]
+    assert heading[-1] < 3.0 * sigma[-1]
 
 
 def test_epochs_err_as_their_geometry_says():
