@@ -40,7 +40,7 @@ class TrackingGains(Protocol):
     """What a difference, measured less computed, corrects."""
 
     def fix(self, elapsed: float) -> tuple[FloatArray, FloatArray]:
-        """Of place and velocity, `elapsed` s after the fix before: (3, 2) place, velocity, tilt of a level axis; (2, 2) vertical."""
+        """Of place and velocity `elapsed` s after the fix before: (3, 2) place, velocity, tilt of a level axis; (2, 2) up."""
         ...
 
     def attitude(self, elapsed: float) -> tuple[FloatArray, float]:

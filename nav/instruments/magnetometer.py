@@ -177,7 +177,7 @@ def _check(values: FloatArray, size: float, unknowns: int) -> None:
         raise MagnetometerRefused(f"magnetometer: {len(flux)} readings for {unknowns} unknowns; take some hundred")
     _, spread, axes = np.linalg.svd(flux - flux.mean(axis=0), full_matrices=False)
     if spread[2] < FLAT * spread[0]:
-        thin = [_words(axes[2]), _words(-axes[2])]
+        thin = [_words(axes[2]), _words(-1.0 * axes[2])]
         raise MagnetometerRefused(
             f"magnetometer: the readings lie in a plane; turn the vehicle until the field points {' and '.join(thin)}"
         )
@@ -197,7 +197,8 @@ def _quadric(flux: FloatArray, size: float) -> tuple[FloatArray, FloatArray]:
         )
     centre = -np.linalg.solve(shape, found[6:])
     values, axes = np.linalg.eigh(shape / (1.0 + centre @ shape @ centre))
-    return axes @ np.diag(np.sqrt(values)) @ axes.T, middle + size * centre
+    matrix: FloatArray = axes @ np.diag(np.sqrt(values)) @ axes.T
+    return matrix, middle + size * centre
 
 
 def _sizes(
@@ -215,7 +216,8 @@ def _sizes(
 
 def _solved(rows: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The step of Gauss-Newton, and the normal matrix."""
-    return np.linalg.lstsq(rows, left, rcond=None)[0], rows.T @ rows
+    step: FloatArray = np.linalg.lstsq(rows, left, rcond=None)[0]
+    return step, rows.T @ rows
 
 
 def _inverse(normal: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hil.geometry import attitude_difference, position_error
 from hil.scenario import Channel, MotionConfig
 from hil.study.aiding import GNSS_SIGMA, gnss_rows, moved, turns
-from hil.study.alignment.records import FIX_S, GRAVITY, STEP, four_antennas, ideal, sensed, sky
+from hil.study.alignment.records import FIX_S, GRAVITY, four_antennas, ideal, sensed, sky
 from hil.world.motion import Motion
 from nav.aiding import AIDING
 from nav.filter.gnss_attitude import GnssAttitude
@@ -25,8 +25,8 @@ def motion(name: str) -> Motion:
     """`straight`: level at 70 m/s to the north-east; `turns`: circles and straights (:func:`hil.study.aiding.turns`)."""
     if name == "turns":
         return turns()
-    way = {"north": Channel(rate=50.0), "east": Channel(rate=50.0), "up": Channel(offset=500.0)}
-    return Motion(MotionConfig(attitude="coordinated", **way))
+    east = north = Channel(rate=50.0)
+    return Motion(MotionConfig(attitude="coordinated", north=north, east=east, up=Channel(offset=500.0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,8 @@ class Flight:
         """(n - 1, 4): tilt and heading, rad, velocity and position, 3-D, m/s and m, of solutions (n - 1, 10) at the fixes."""
         true = self.truth[1:]
         _, tilt, heading = attitude_difference(np.ascontiguousarray(solved[:, 6:]), true["q_nb"])
-        way = position_error(*np.ascontiguousarray(solved[:, :3].T), true)
+        lat, lon, height = np.ascontiguousarray(solved[:, :3].T)
+        way = position_error(lat, lon, height, true)
         speed = solved[:, 3:6] - true["vel_n"]
         return np.stack([tilt, heading, np.linalg.norm(speed, axis=1), np.linalg.norm(way, axis=1)], axis=1)
 
@@ -72,9 +73,8 @@ def fly(
     stars = sky(rng)
     fixes = gnss_rows(truth, rng)
     if wandering:
-        place = fixes["value"][:, :3].copy()
-        shifted = moved(*np.ascontiguousarray(place.T), _wander(len(truth), rng))
-        fixes["value"][:, :3] = np.stack(shifted, axis=1)
+        lat, lon, height = np.ascontiguousarray(fixes["value"][:, :3].T)
+        fixes["value"][:, :3] = np.stack(moved(lat, lon, height, _wander(len(truth), rng)), axis=1)
     found = [four_antennas(true, stars, rng) for true in truth]
     places = fixes["value"][:, :2].tolist()
     attitudes = np.array([one.row(t, *at) for one, t, at in zip(found, truth["time"], places, strict=True)], AIDING)
@@ -114,4 +114,3 @@ def noise(grade: Grade, flight: Flight) -> Noise:
         heading=math.sqrt(down),
         period=FIX_S,
     )
-

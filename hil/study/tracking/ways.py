@@ -21,7 +21,8 @@ PREDICT_S = 0.1
 def track(flight: Flight, gains: TrackingGains) -> FloatArray:
     """Solutions (n - 1, 10) at the fixes, from one epoch of the antennas and pulled to those after it."""
     core, first, imu = Strapdown("two-sample", "wander"), flight.fixes[0]["value"], flight.imu
-    start_from_epoch(core, *first[:3].tolist(), first[3:], flight.start)
+    lat, lon, height = first[:3].tolist()
+    start_from_epoch(core, lat, lon, height, first[3:], flight.start)
     tracking = Tracking(core, gains, 0.0)
     out, still = (np.empty((STRIDE, 3)), np.empty((STRIDE, 3)), np.empty((STRIDE, 4))), np.zeros(3)
     solved = np.empty((len(flight.fixes) - 1, 10))
@@ -53,4 +54,3 @@ def filtered(flight: Flight, belief: Tuning, *, antennas: bool) -> FloatArray:
         navigator.process(flight.imu.rows(k * STRIDE, (k + 1) * STRIDE))
         solved[k] = navigator.solution
     return solved
-
