@@ -56,7 +56,7 @@ class AidedRecord:
 
     def __init__(self, count: int) -> None:
         step = 1.0 / RATE_HZ
-        noise = [1e-6, 1e-6, 1e-6, 1e-4, 1e-4, 1e-4] * np.random.default_rng(0).standard_normal((count, 6))
+        noise = np.random.default_rng(0).standard_normal((count, 6)) * np.repeat([1e-6, 1e-4], 3)
         noise[:, 5] -= 9.812 * step
         self.samples = [(step * (k + 1), step, *one) for k, one in enumerate(noise.tolist())]
         self._behind: list[list[NDArray[np.void]]] = [[] for _ in self.samples]
