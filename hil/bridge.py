@@ -28,8 +28,10 @@ from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from drivers.can.frames import FrameArray, frames
 from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
+from hil.calibration import NO_HEAD, validated
 from hil.control import Control
 from hil.magnetic import magnetic_field
+from hil.magnetometer import correct
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
@@ -224,7 +226,9 @@ class Loop:
         """Device time at which the first sample began."""
         self._withheld = 0
         self._combiner = HeadCombiner(head_model(scenario.head))
-        self._calibrated = None if scenario.head.calibration is None else int(scenario.head.calibration["serial"])
+        calibration = validated(scenario.head.calibration or NO_HEAD, "in the loop")
+        self._calibrated = calibration.serial or None  # 0: of no particular head
+        self._magnetometer = calibration.magnetometer
         self._outlets = outlets
         self._live = order.paced and order.file is None
         self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
@@ -257,6 +261,8 @@ class Loop:
         if not aided.any():
             return len(batch) > 0 and self._take(batch)
         rows, places = self._aiding.decode(batch, self._now)
+        if self._magnetometer is not None:
+            correct(self._magnetometer, rows)
         cuts = np.flatnonzero(aided[1:] & ~aided[:-1]) + 1
         got, start, taken = False, 0, 0
         for stop in (*cuts.tolist(), len(batch)):

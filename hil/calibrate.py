@@ -15,9 +15,11 @@ import numpy as np
 from drivers import FrameDriver, make_driver
 from drivers.can.frames import frames
 from drivers.logs.recording import EVENT, RecordingReader
-from hil.calibration import CHANNELS, CalibrationFile, from_fit, rotor_of
-from hil.calibration_sequence import PositionConfig, Say, TurnConfig, read_sequence
-from hil.scenario import Scenario, load, validated
+from hil.calibration import CHANNELS, NO_HEAD, CalibrationFile, from_fit, rotor_of, validated
+from hil.calibration_sequence import PositionConfig, Say, SequenceConfig, TurnConfig, read_sequence
+from hil.magnetometer import fit as fit_magnetometer
+from hil.scenario import Scenario, load
+from hil.scenario import validated as validated_scenario
 from hil.source import FileSource, is_own
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements
@@ -27,7 +29,12 @@ from nav.rotation import dcm_from_euler
 
 
 def calibrate(
-    recordings: Sequence[Path], sequence_file: Path, scenario_file: str | None, date: datetime.date | None, say: Say
+    recordings: Sequence[Path],
+    sequence_file: Path,
+    scenario_file: str | None,
+    date: datetime.date | None,
+    say: Say,
+    base: CalibrationFile | None = None,
 ) -> CalibrationFile:
     """Fit a calibration.
 
@@ -43,6 +50,8 @@ def calibrate(
         None: that of the first frame.
     say : callable
         Gets a line for each recording that is read.
+    base : CalibrationFile, optional
+        Calibration of the head to which that of a magnetometer alone is added; None: a head without errors.
 
     Raises
     ------
@@ -52,17 +61,43 @@ def calibrate(
     sequence = read_sequence(sequence_file)
     steps = (*sequence.position, *sequence.turn)
     given = {path.name: path for path in recordings}
-    missing = sorted({step.recording for step in steps} - set(given))
+    swing = sequence.magnetometer
+    named = {step.recording for step in steps} | ({swing.recording} if swing else set())
+    missing = sorted(named - set(given))
     if missing:
         raise HilError(f"sequence {sequence_file}: recording = {missing[0]!r}: it is not among the recordings given")
-    unused = sorted(set(given) - {step.recording for step in steps})
+    unused = sorted(set(given) - named)
     if unused:
         raise HilError(
             f"sequence {sequence_file}: nothing is said of the recording {unused[0]}; leave it out or say it"
         )
-    if not steps:
-        raise HilError(f"sequence {sequence_file}: no [[position]] and no [[turn]]")
-    head = load(scenario_file).head if scenario_file else _scenario_of(recordings[0]).head
+    if not named:
+        raise HilError(f"sequence {sequence_file}: no [[position]], no [[turn]] and no [magnetometer]")
+    if steps and base is not None:
+        raise HilError(f"sequence {sequence_file}: it has positions or turns of its own: leave the base out")
+    if steps:
+        found = _head(given, sequence, scenario_file, date, say)
+    else:
+        day = date or datetime.datetime.now(datetime.UTC).date()
+        found = base or validated(NO_HEAD | {"date": day}, "of no head")
+    if swing is None:
+        return found
+    table = fit_magnetometer(swing, given[swing.recording])
+    say(f"{swing.recording}: {table.readings} readings of the magnetometer")
+    return found.model_copy(update={"magnetometer": table})
+
+
+def _head(
+    given: dict[str, Path],
+    sequence: SequenceConfig,
+    scenario_file: str | None,
+    date: datetime.date | None,
+    say: Say,
+) -> CalibrationFile:
+    """Gyros and accelerometers from the positions and turns."""
+    steps = (*sequence.position, *sequence.turn)
+    given = {name: path for name, path in given.items() if name in {step.recording for step in steps}}
+    head = load(scenario_file).head if scenario_file else _scenario_of(next(iter(given.values()))).head
     rotors = (rotor_of(head.rotor), rotor_of(head.rotor)) if head.instruments == "dtg" else None
     stretches: list[Stretch] = []
     serials: dict[int, str] = {}
@@ -100,7 +135,7 @@ def _scenario_of(path: Path) -> Scenario:
     reader = RecordingReader.open(path)
     reader.close()
     table = reader.header.get("scenario")
-    return validated(table, f"in recording {path}") if isinstance(table, dict) else load(None)
+    return validated_scenario(table, f"in recording {path}") if isinstance(table, dict) else load(None)
 
 
 def _samples(path: Path) -> tuple[HeadIncrements, FrameDriver, datetime.date]:
@@ -156,4 +191,13 @@ def rows(file: CalibrationFile) -> list[dict[str, Any]]:
                     {"axis": axis, "key": name, "value": v, "sigma": s if math.isfinite(s) else None}
                     for axis, v, s in zip(axes, value, one, strict=True)
                 ]
+    table = file.magnetometer
+    if table is not None and table.hard_iron_sigma_ut is not None and table.matrix_sigma is not None:
+        names = [f"m{axis}" for axis in "xyz"]
+        pairs = [("hard_iron_ut", table.hard_iron_ut, table.hard_iron_sigma_ut)]
+        pairs += [(f"matrix[{k}]", table.matrix[k], table.matrix_sigma[k]) for k in range(3)]
+        for key, value, one in pairs:
+            listed += [
+                {"axis": m, "key": key, "value": v, "sigma": s} for m, v, s in zip(names, value, one, strict=True)
+            ]
     return listed

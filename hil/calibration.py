@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
-from hil.scenario import Finite, RotorConfig, explained
+from hil.scenario import Finite, RotorConfig, Vector, explained
 from nav.errors import HilError
 from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.calibration import ACCELEROMETER_TERMS, CASES, GYRO_TERMS, POWERS, Calibration
@@ -62,6 +62,8 @@ UNITS = {
 }
 """Unit in the file and its size; polynomials of the temperature: of the first power, the second by K^2 and so on."""
 CHANNELS = {"gyro": ("g1x", "g1y", "g2y", "g2z"), "accelerometer": ("ax", "ay", "az")}
+NO_HEAD = {"serial": 0, "date": datetime.date.min, "gyro": {}, "accelerometer": {}}
+"""Calibration of no particular head, without errors."""
 Numbers = tuple[float, ...]
 Table = dict[str, Any]
 
@@ -117,8 +119,23 @@ class Residuals(_Model):
     redundancy: tuple[Finite, Finite]
 
 
+class MagnetometerTable(_Model):
+    """Of the magnetometer beside the head: flux in b = matrix (reading - hard iron)."""
+
+    source: Annotated[int, Field(ge=0, lt=256)] = 0
+    """Its number among the magnetometers on the bus."""
+    hard_iron_ut: Vector
+    matrix: tuple[Vector, Vector, Vector]
+    """Rows of S: soft iron, scale and misalignment."""
+    hard_iron_sigma_ut: Vector | None = None
+    matrix_sigma: tuple[Vector, Vector, Vector] | None = None
+    residual_ut: Finite | None = None
+    """Rms of what the fit left of one component."""
+    readings: Annotated[int, Field(ge=0)] = 0
+
+
 class CalibrationFile(_Model):
-    """Calibration of one head."""
+    """Calibration of one head, and of the magnetometer beside it."""
 
     serial: Annotated[int, Field(ge=0, lt=2**32)]
     date: datetime.date
@@ -130,6 +147,7 @@ class CalibrationFile(_Model):
     accelerometer: _table("accelerometer", Finite, 0.0)  # type: ignore[valid-type]
     rotor: tuple[RotorConfig, RotorConfig] | None = None
     """Measured rotors of gyro 1 and gyro 2; left out: those of the scenario."""
+    magnetometer: MagnetometerTable | None = None
     undetermined: tuple[str, ...] = ()
     sigma: SigmaTables | None = None
     residual: Residuals | None = None

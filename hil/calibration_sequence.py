@@ -8,7 +8,7 @@ import math
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -80,8 +80,37 @@ class TurnConfig(PositionConfig):
         return turn
 
 
+class SwingConfig(_Model):
+    """A magnetometer was turned through all directions in a steady field."""
+
+    recording: str
+    known: Literal["nothing", "vertical", "attitude"] = "nothing"
+    """What the recording says beside each reading: nothing, forces at rest, or heading, pitch and roll."""
+    source: Annotated[int, Field(ge=0, lt=256)] = 0
+    field_ut: Annotated[float, Field(gt=0)] | None = None
+    """Size of the Earth's field there."""
+    field_ned_ut: Vector | None = None
+    """The field itself, in place of its size."""
+
+    @model_validator(mode="after")
+    def _one_field(self) -> "SwingConfig":
+        if (self.field_ut is None) == (self.field_ned_ut is None):
+            raise ValueError("give either field_ut or field_ned_ut")
+        if self.known == "attitude" and self.field_ned_ut is None:
+            raise ValueError('known = "attitude" needs field_ned_ut')
+        return self
+
+    def vector(self) -> FloatArray:
+        """The field, north, east, down, uT; known only where it was given."""
+        return np.array(self.field_ned_ut or (0.0, 0.0, 0.0))
+
+    def size(self) -> float:
+        """Of the field, uT."""
+        return self.field_ut or float(np.linalg.norm(self.vector()))
+
+
 class SequenceConfig(_Model):
-    """What was done with a head."""
+    """What was done with a head, and with the magnetometer beside it."""
 
     latitude_deg: Annotated[float, Field(gt=-90, lt=90)]
     height_m: Finite = 0.0
@@ -89,6 +118,7 @@ class SequenceConfig(_Model):
     """How well the attitudes are known, about each axis; 0: exactly."""
     position: tuple[PositionConfig, ...] = ()
     turn: tuple[TurnConfig, ...] = ()
+    magnetometer: SwingConfig | None = None
 
 
 def read_sequence(path: Path) -> SequenceConfig:

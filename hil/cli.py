@@ -248,13 +248,16 @@ def calibrate(
     ] = None,
     scenario: Annotated[str | None, typer.Option(help="Scenario with rotors and layout of the head.")] = None,
     date: Annotated[str | None, typer.Option(help="YYYY-MM-DD; left out: that of the recordings.")] = None,
+    base: Annotated[
+        Path | None, typer.Option(help="Calibration of the head, where the recording is of a magnetometer alone.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Fit the calibration of a head to recordings of positions at rest and of turns."""
+    """Fit the calibration of a head to recordings of positions at rest and of turns, and of a magnetometer turned about."""
     if out is None:
         raise HilError("--out is missing: the calibration file, or with --simulate the folder")
     if simulate is not None:
-        if recordings or sequence or scenario or date:
+        if recordings or sequence or scenario or date or base:
             raise HilError("--simulate makes the recordings: give nothing but --out beside it")
         from hil.calibration_sequence import SEQUENCE
         from hil.calibration_sequence import simulate as make
@@ -265,23 +268,30 @@ def calibrate(
         return
     if not recordings or sequence is None:
         raise HilError("give recordings and --sequence, or --simulate SCENARIO to make them")
-    _calibrate(recordings, sequence, out, scenario, date, as_json=as_json)
+    _calibrate(recordings, sequence, out, scenario, date, base, as_json=as_json)
 
 
 def _calibrate(
-    recordings: list[Path], sequence: Path, out: Path, scenario: str | None, date: str | None, *, as_json: bool
+    recordings: list[Path],
+    sequence: Path,
+    out: Path,
+    scenario: str | None,
+    date: str | None,
+    base: Path | None,
+    *,
+    as_json: bool,
 ) -> None:
     import datetime
 
     from hil.calibrate import calibrate as fit_recordings
     from hil.calibrate import rows
-    from hil.calibration import write
+    from hil.calibration import read, write
 
     try:
         day = None if date is None else datetime.date.fromisoformat(date)
     except ValueError as error:
         raise HilError(f"--date {date}: expected YYYY-MM-DD") from error
-    file = fit_recordings(recordings, sequence, scenario, day, _say)
+    file = fit_recordings(recordings, sequence, scenario, day, _say, None if base is None else read(base))
     write(out, file)
     if as_json:
         residual = None if file.residual is None else file.residual.model_dump()

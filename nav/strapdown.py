@@ -21,9 +21,10 @@ from nav.earth import RATE, curvature_radii
 from nav.errors import HilError
 from nav.gravitation import field_code
 from nav.increments import FloatArray, first_bad
+from nav.kernel import kernel
 from nav.mechanization import cartesian, geographic, wander
-from nav.rotation import normalised, product, quaternion_from_rotation_vector
-from nav.turn import turns_between
+from nav.rotation import normalised
+from nav.turn import multiply, quaternion_of, turns_between
 
 MECHANIZATIONS = kernels.MECHANIZATIONS
 ATTITUDES = (
@@ -201,14 +202,7 @@ class Strapdown:
         attitude : (3,) float
             Rotation vector in n that takes the true attitude to the computed one, rad, of any size.
         """
-        lat, height = float(self.solution[0]), float(self.solution[2])
-        meridian, prime = curvature_radii(math.sin(lat))
-        lon = float(self.solution[1]) - position[1] / ((prime + height) * math.cos(lat))
-        self.solution[0] = lat - position[0] / (meridian + height)
-        self.solution[1] = math.remainder(lon, 2.0 * math.pi)
-        self.solution[2] = height + position[2]
-        self.solution[3:6] -= velocity
-        self.solution[6:10] = product(quaternion_from_rotation_vector(-attitude), self.solution[6:10])
+        _take_off(self.solution, position, velocity, attitude)
         before = self._state[cartesian.PREVIOUS_PART].copy()
         self._settle(self.mechanization, self.azimuth)
         if self.mechanization == "inertial-source":
@@ -381,6 +375,21 @@ class Strapdown:
         before = np.concatenate([self._q[None], rows[:-1]])
         turns_between(before, rows, self._dq[:n])
         self._q = rows[-1].copy()
+
+
+@kernel
+def _take_off(solution: FloatArray, position: FloatArray, velocity: FloatArray, attitude: FloatArray) -> None:
+    """`Strapdown.correct` of the solution (10,)."""
+    meridian, prime = curvature_radii(math.sin(solution[0]))
+    lon = solution[1] - position[1] / ((prime + solution[2]) * math.cos(solution[0]))
+    solution[0] -= position[0] / (meridian + solution[2])
+    solution[1] = lon - 2.0 * math.pi * math.floor(lon / (2.0 * math.pi) + 0.5)
+    solution[2] += position[2]
+    for i in range(3):
+        solution[3 + i] -= velocity[i]
+    turn = np.empty(4)
+    turn[0], turn[1], turn[2], turn[3] = quaternion_of(-attitude[0], -attitude[1], -attitude[2])
+    multiply(turn, solution[6:10], solution[6:10])
 
 
 class _Address(int):

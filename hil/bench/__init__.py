@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from hil.bench import attitude, chain, instruments, strapdown
+from hil.bench import aided, attitude, chain, instruments, strapdown
 from hil.bench.timing import Row, Sizes
 
 
@@ -14,4 +14,10 @@ def measure(say: Callable[[str], None], sizes: Sizes | None = None) -> list[Row]
     """
     say("compiling and measuring, about a minute")
     sizes = sizes or Sizes()
-    return [*chain.rows(sizes), *strapdown.rows(sizes), *attitude.rows(sizes), *instruments.rows(sizes)]
+    return [
+        *chain.rows(sizes),
+        *aided.rows(sizes),
+        *strapdown.rows(sizes),
+        *attitude.rows(sizes),
+        *instruments.rows(sizes),
+    ]

@@ -9,7 +9,18 @@ from nav.errors import HilError
 
 _MODULES = {
     name: f"hil.study.{name}"
-    for name in ("orientation", "navigation", "noise", "dtg", "pendulum", "redundancy", "drift", "alignment", "aiding")
+    for name in (
+        "orientation",
+        "navigation",
+        "noise",
+        "dtg",
+        "pendulum",
+        "redundancy",
+        "drift",
+        "alignment",
+        "aiding",
+        "tracking",
+    )
 }
 """Studies by name: modules with a function ``run() -> Study``."""
 

@@ -172,13 +172,13 @@ def gnss_rows(
     noise = sigma * rng.standard_normal((len(truth), 6))
     rows = np.zeros(len(truth), AIDING)
     rows["time"], rows["kind"], rows["sigma"] = truth["time"], Kind.GNSS, sigma
-    lat, lon, height = _moved(truth["lat"], truth["lon"], truth["height"], noise[:, :3])
+    lat, lon, height = moved(truth["lat"], truth["lon"], truth["height"], noise[:, :3])
     rows["value"][:, 0], rows["value"][:, 1], rows["value"][:, 2] = lat, lon, height
     rows["value"][:, 3:] = truth["vel_n"] + noise[:, 3:]
     return rows
 
 
-def _moved(
+def moved(
     lat: FloatArray, lon: FloatArray, height: FloatArray, ned: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Places (n,) moved north, east, down, (n, 3) m."""
@@ -191,7 +191,7 @@ def begin(navigator: AidedNavigator, truth: np.void, tilt: tuple[float, float], 
     """Start from a row of truth with drawn errors: position and velocity of GNSS, tilt and heading of `tilt`, rad."""
     sigma = np.array([*GNSS_SIGMA[:3], *GNSS_SIGMA[3:], tilt[0], tilt[0], tilt[1]])
     wrong = sigma * rng.standard_normal(9)
-    place = _moved(truth["lat"][None], truth["lon"][None], truth["height"][None], wrong[None, :3])
+    place = moved(truth["lat"][None], truth["lon"][None], truth["height"][None], wrong[None, :3])
     lat, lon, height = (float(part[0]) for part in place)
     q_nb = product(quaternion_from_rotation_vector(wrong[6:]), truth["q_nb"])
     navigator.start(float(truth["time"]), lat, lon, height, truth["vel_n"] + wrong[3:6], q_nb, sigma)

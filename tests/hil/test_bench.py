@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil.bench import attitude, strapdown
+from hil.bench import aided, attitude, strapdown
 from hil.bench.strapdown import StrapdownRecord, c_two_sample
 from hil.bench.timing import Sizes, Work, paired_ratio, rows_in_turns
 from nav.strapdown import MECHANIZATIONS, Strapdown
@@ -81,3 +81,14 @@ def test_works_take_turns():
 def test_a_missing_peer_leaves_no_trace():
     (row,) = rows_in_turns([Work("a", "a", lambda: None, 1, "absent", "b", "c")], 2)
     assert (row["peer"], row["peer_ns"], row["ratio_to_c"]) == ("", None, None)
+
+
+def test_the_aided_loop_has_its_rows_and_every_measurement_is_taken():
+    rows = {row["id"]: row for row in aided.rows(Sizes(repeats=1, batch=1, calls=60))}
+    assert set(rows) == {"aided-core", "aided-27", "aided-27-beside", "aided-35", "aided-35-beside"}
+    for states in (27, 35):
+        assert rows[f"aided-{states}-beside"]["ns"] == rows[f"aided-{states}"]["ns"] - rows["aided-core"]["ns"]
+    navigator = aided.AidedRecord(1000).aided(aided.STATES[35])
+    taken = {(one.channel.name, one.accepted + one.rejected) for one in navigator.health}
+    assert taken == {("GNSS_POSITION", 5), ("GNSS_VELOCITY", 5), ("BARO", 10), ("MAGNETIC", 25)}
+    assert len(navigator.used) == 35

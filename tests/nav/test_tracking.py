@@ -12,7 +12,8 @@ from hil.world.pole import PoleFlight
 from nav.aiding import Kind, aiding
 from nav.earth import curvature_radii, normal_gravity
 from nav.errors import HilError
-from nav.filter.tracking import Gains, Tracking
+from nav.filter.tracking import Tracking
+from nav.filter.tracking_gains import Gains
 from nav.rotation import attitude_error
 from nav.strapdown import Strapdown
 

@@ -27,7 +27,8 @@ from hil.world.motion import TRUTH
 from nav.alignment.analytic import Alignment
 from nav.alignment.optimization import MotionAlignment
 from nav.filter.gnss_attitude import start_from_epoch
-from nav.filter.tracking import Gains, Tracking
+from nav.filter.tracking import Tracking
+from nav.filter.tracking_gains import Gains
 from nav.increments import FloatArray, ImuIncrements
 from nav.instruments.grades import GRADES
 from nav.rotation import attitude_error, quaternion_from_euler
