@@ -13,8 +13,8 @@ from drivers.can.frames import frames
 from drivers.logs.recording import EVENT
 from hil.calibration import MagnetometerTable
 from hil.calibration_sequence import SwingConfig
-from hil.offline import read_table
 from hil.source import FileSource
+from hil.tables import read_table
 from nav.aiding import Kind
 from nav.errors import HilError
 from nav.increments import FloatArray

@@ -1,15 +1,15 @@
 """Aided navigation of the sensor grades: is the filter's own error estimate true, and how good is the picture?
 
-Each run draws its instruments, its start and the noise of GNSS. Two kinds of instruments:
+Each run draws its instruments, its start and the noise of GNSS, apart for each grade and kind. Two kinds of instruments:
 
-    own     what the filter believes: turn-on values of its sigmas, its white noise, its random walks
-    full    the table of grades: flicker, misalignment and drift by force, which the filter knows as noise only
+    own     what the filter believes: turn-on values of its sigmas, its noise, its random walks
+    full    the table of grades: flicker and drift by force, which the filter knows as noise only
 """
 
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from hil.geometry import attitude_difference, position_error
 from hil.scenario import Channel as ChannelConfig
 from hil.scenario import MotionConfig, Sine
-from hil.study.report import Band, Line, Plot, Row, Study, at_most, near, shown
+from hil.study.aiding_runs import GAINS, PARTS, Runs, gains, growth, plots
+from hil.study.report import Row, Study, at_most, near, shown
 from hil.world.motion import Motion
 from nav.aiding import AIDING, Kind
 from nav.earth import curvature_radii
 from nav.filter.aided import AidedNavigator, Settings
 from nav.filter.health import Channel
-from nav.filter.states import GYRO_MISALIGNMENT, STATES, Tuning, tuning
+from nav.filter.states import GYRO_MISALIGNMENT, LEVEL, STATES, Tuning, tuning
 from nav.increments import FloatArray, ImuIncrements
 from nav.instruments.accelerometer_errors import Accelerometers
 from nav.instruments.grades import GRADES, Grade
@@ -42,58 +43,11 @@ _DEG = math.pi / 180.0
 TILT = {"dtg": (0.01 * _DEG, 0.1 * _DEG), "tactical": (0.1 * _DEG, 0.5 * _DEG), "mems": (0.5 * _DEG, 3.0 * _DEG)}
 """Sigma of tilt and heading at the start, rad."""
 Instruments = Literal["own", "full"]
+OWN = Settings(predict_s=0.1)
+"""For the own instruments, of which there are twice as many runs: five times longer intervals than usual."""
 SEEDS, SETTLED_S, OUTAGE_S = 50, 60.0, (120.0, 180.0)
 LIMITS_DEG = {"dtg": (0.01, 0.06), "tactical": (0.05, 0.2), "mems": (0.2, 1.0)}
 """Of tilt and heading, rms."""
-_PARTS = ("position", "velocity", "attitude")
-
-
-@dataclass(frozen=True, slots=True)
-class Runs:
-    """What some runs gave, a row a second.
-
-    Attributes
-    ----------
-    time : (n,) float
-        s.
-    errors : (seeds, n, 9) float
-        Position, velocity (n), attitude: m, m/s, rad.
-    sigma : (seeds, n, STATES) float
-        What the filter says of each state.
-    nees : (seeds, n, 3) float
-        e P^-1 e of position, velocity, attitude.
-    tilt, heading : (seeds, n) float
-        Attitude errors as a user sees them, rad.
-    nis : (seeds, m, 2) float
-        Of GNSS position and velocity, 3 degrees of freedom each.
-    rejected : int
-        Measurements rejected, of all runs.
-    """
-
-    time: FloatArray
-    errors: FloatArray
-    sigma: FloatArray
-    nees: FloatArray
-    tilt: FloatArray
-    heading: FloatArray
-    nis: list[FloatArray]
-    rejected: int
-
-    def inside(self, since: float, until: float, *, upper_only: bool = False) -> FloatArray:
-        """(3,): share of the epochs `since` to `until`, s, whose NEES, averaged over the runs, is inside its 95 % bounds."""
-        runs = len(self.errors)
-        mean = self.nees[:, (self.time >= since) & (self.time <= until)].mean(axis=0)
-        low, high = nees_bounds(runs)
-        good = mean <= high if upper_only else (mean >= low) & (mean <= high)
-        return np.asarray(good.mean(axis=0), np.float64)
-
-
-def nees_bounds(runs: int) -> tuple[float, float]:
-    """95 % bounds of the mean NEES of 3 states over independent runs: chi-square of 3 `runs` (Wilson and Hilferty)."""
-    k = 3.0 * runs
-    part = 2.0 / (9.0 * k)
-    low, high = (k * (1.0 - part + z * math.sqrt(part)) ** 3 / runs for z in (-1.959964, 1.959964))
-    return low, high
 
 
 def fly(
@@ -111,8 +65,6 @@ def fly(
     motion = turns()
     true = record(motion, duration)
     belief = tuning(GRADES[name], bias_removed=True)
-    if instruments == "own":
-        belief = replace(belief, by_rate=np.zeros((3, 3)))
     looks = motion.truth(np.arange(round(duration / LOOK_S) + 1) * LOOK_S)
     times = np.arange(1, round(duration / GNSS_S) + 1) * GNSS_S
     if outage is not None:
@@ -120,7 +72,8 @@ def fly(
     fixes = motion.truth(times)
 
     def one(seed: int) -> tuple[FloatArray, ...]:
-        rng, *parts = np.random.default_rng(seed).spawn(4)
+        apart = seed, list(GRADES).index(name), int(instruments == "full")
+        rng, *parts = np.random.default_rng(apart).spawn(4)
         if instruments == "own":
             data = _own(belief, true.dtheta, true.dvel, parts[0])
         else:
@@ -132,9 +85,7 @@ def fly(
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         found = list(pool.map(one, range(seeds)))
-    errors, sigma, nees, tilt, heading = (np.array([run[k] for run in found]) for k in range(5))
-    rejected = int(sum(run[6] for run in found))
-    return Runs(looks["time"][1:].copy(), errors, sigma, nees, tilt, heading, [run[5] for run in found], rejected)
+    return Runs(looks["time"][1:].copy(), *(np.array(part) for part in zip(*found, strict=True)))
 
 
 def turns() -> Motion:
@@ -202,12 +153,15 @@ def _own(
 ) -> tuple[FloatArray, FloatArray]:
     """Increments by the filter's own model."""
     n, root = len(dtheta), math.sqrt(STEP)
+    w, f = dtheta / STEP, dvel / STEP + np.array([0.0, 0.0, LEVEL])
+    density = np.tile(belief.white**2, (n, 1))
+    density[:, :3] += w**2 @ belief.by_rate.T + f**2 @ belief.by_force.T
     out = []
     skew = (belief.sigma[GYRO_MISALIGNMENT] * rng.standard_normal(6)).reshape(3, 2)
     for first, true in ((0, dtheta), (3, dvel)):
         bias, scale = (belief.sigma[part : part + 3] * rng.standard_normal(3) for part in (9 + first, 15 + first))
         walk = belief.walk[9 + first : 12 + first] * root * rng.standard_normal((n, 3))
-        noise = belief.white[first : first + 3] * root * rng.standard_normal((n, 3))
+        noise = np.sqrt(density[:, first : first + 3]) * root * rng.standard_normal((n, 3))
         out.append((1.0 + scale) * true + STEP * (bias + np.cumsum(walk, axis=0)) + noise)
     out[0] += skew[:, 0] * np.roll(dtheta, -1, axis=1) + skew[:, 1] * np.roll(dtheta, -2, axis=1)
     return out[0], out[1]
@@ -223,7 +177,7 @@ def _full(
 
 
 def _follow(navigator: AidedNavigator, looks: NDArray[np.void], imu: ImuIncrements) -> tuple[FloatArray, ...]:
-    """Run; errors, sigma and NEES at each look."""
+    """Run; what `Runs` holds of one."""
     n, stride = len(looks) - 1, round(LOOK_S / STEP)
     solutions, sigma, covariance = np.empty((n, 10)), np.empty((n, STATES)), np.empty((n, 9, 9))
     for k in range(n):
@@ -249,82 +203,63 @@ def _follow(navigator: AidedNavigator, looks: NDArray[np.void], imu: ImuIncremen
         [one.nis for one in judged if one.channel == channel]
         for channel in (Channel.GNSS_POSITION, Channel.GNSS_VELOCITY)
     ]
-    rejected = np.array(sum(not one.accepted for one in judged))
-    return errors, sigma, nees, tilt, heading, np.array(nis).T, rejected
+    # P of after an update is also that of the gain, P H^T R^-1.
+    height = covariance[:, 2, 2] / GNSS_SIGMA[2] ** 2
+    lean, turn = (
+        np.linalg.norm(covariance[:, part, 3:5], axis=(1, 2)) / GNSS_SIGMA[3] ** 2
+        for part in (slice(6, 8), slice(8, 9))
+    )
+    return errors, sigma, nees, tilt, heading, np.array(nis).T, np.stack([height, lean, turn], axis=1)
 
 
 def run(seeds: int = SEEDS, settled: float = SETTLED_S, outage: tuple[float, float] = OUTAGE_S) -> Study:
     """All of it: consistency and accuracy from `settled` to the beginning of the outage, then the outage."""
     rows: list[Row] = []
     flown = {}
-    for name, grade in GRADES.items():
-        own = fly(name, seeds, outage[0], "own")
+    for name in GRADES:
+        own = fly(name, 2 * seeds, outage[1], "own", settings=OWN)
         full = fly(name, seeds, outage[1], "full", outage)
         flown[name] = own, full
-        where = f"{grade.name}, {seeds} runs"
-        for what, runs in (("own", own), ("full", full)):
-            outside = 1.0 - runs.inside(settled, outage[0], upper_only=what == "full")
-            for part, share in zip(_PARTS, outside, strict=True):
-                say = "outside the" if what == "own" else "above the upper"
-                words = f"{where}, {what} instruments: share of epochs with the NEES of {part} {say} 95 % bound"
-                rows.append(at_most(f"{name}-{what}-{part}-outside", words, float(share), "1", 0.1))
-        window = (full.time >= settled) & (full.time <= outage[0])
-        for what, angle, limit in zip(("tilt", "heading"), (full.tilt, full.heading), LIMITS_DEG[name], strict=True):
-            rms = math.degrees(math.sqrt(float((angle[:, window] ** 2).mean())))
-            rows.append(at_most(f"{name}-{what}", f"{where}: rms of {what}", rms, "deg", limit))
-        spread, said = growth(full)
-        words = f"{where}: after {outage[1] - outage[0]:g} s without GNSS, rms of position over sigma"
-        rows.append(near(f"{name}-outage-ratio", words, spread[-1] / said[-1], "1", 0.25, reference=1.0))
-        rows.append(shown(f"{name}-outage", f"{where}: rms of position then", spread[-1], "m", reference=said[-1]))
-        nis = np.concatenate(own.nis).mean(axis=0) / 3.0
-        for what, value in zip(("position", "velocity"), nis, strict=True):
-            rows.append(
-                shown(f"{name}-nis-{what}", f"{where}, own: mean NIS / 3, GNSS {what}", value, "1", reference=1.0)
-            )
+        rows += _consistency(name, "own", own, settled, outage[1]) + _consistency(
+            name, "full", full, settled, outage[0]
+        )
+        rows += _accuracy(name, full, settled, outage)
     about = (
         "Circles and straights at 35 to 80 m/s, exact increments at 100 Hz, instruments drawn for each run, GNSS at 5 Hz with "
-        "white noise of 1.5 m (2.5 m vertical) and 0.05 m/s (0.08). 27 states. Own: instruments by the filter's own model, the "
-        "NEES inside both 95 % bounds of its mean. Full: by the table of grades, under the upper one."
+        "white noise of 1.5 m (2.5 m vertical) and 0.05 m/s (0.08). 27 states. Own: instruments by the filter's own model, GNSS "
+        "to the end, the NEES inside both 95 % bounds of its mean. Full: by the table of grades, under the upper one."
     )
-    return Study("aiding", "Aided navigation of the sensor grades", about, rows, _plots(flown, outage))
+    return Study("aiding", "Aided navigation of the sensor grades", about, rows, plots(flown, outage, GNSS_S))
 
 
-def growth(runs: Runs) -> tuple[FloatArray, FloatArray]:
-    """(n,), (n,): 3-D position error, rms over the runs, and what the filter says, m."""
-    rms = np.sqrt((runs.errors[:, :, :3] ** 2).sum(axis=2).mean(axis=0))
-    return rms, np.sqrt((runs.sigma[:, :, :3] ** 2).sum(axis=2).mean(axis=0))
+def _consistency(name: str, kind: Instruments, runs: Runs, settled: float, until: float) -> list[Row]:
+    rows = []
+    words = f"{GRADES[name].name}, {len(runs.errors)} runs, {kind} instruments: "
+    say = "outside the" if kind == "own" else "above the upper"
+    outside = 1.0 - runs.inside(settled, until, upper_only=kind == "full")
+    nees = runs.nees[:, (runs.time >= settled) & (runs.time <= until)].mean(axis=(0, 1)) / 3.0
+    for k, part in enumerate(PARTS):
+        share = f"{words}share of epochs with the NEES of {part} {say} 95 % bound"
+        rows.append(at_most(f"{name}-{kind}-{part}-outside", share, outside[k], "1", 0.1))
+        mean = f"{words}mean NEES / 3 of {part}"
+        rows.append(shown(f"{name}-{kind}-{part}-nees", mean, nees[k], "1", reference=1.0))
+    for part, nis in zip(PARTS[:2], runs.nis.mean(axis=(0, 1)) / 3.0, strict=True):
+        rows.append(shown(f"{name}-{kind}-{part}-nis", f"{words}mean NIS / 3, GNSS {part}", nis, "1", reference=1.0))
+    return rows
 
 
-def _plots(flown: dict[str, tuple[Runs, Runs]], outage: tuple[float, float]) -> list[Plot]:
-    plots = []
-    for k, part in enumerate(_PARTS):
-        lines = [
-            Line(
-                f"{name}, {what}",
-                runs.time[runs.time <= outage[0]],
-                runs.nees[:, runs.time <= outage[0], k].mean(axis=0),
-            )
-            for name, pair in flown.items()
-            for what, runs in zip(("own", "full"), pair, strict=True)
-        ]
-        time = lines[0].x
-        low, high = nees_bounds(len(next(iter(flown.values()))[0].errors))
-        bounds = [Band("95 %", time, np.full(len(time), low), np.full(len(time), high))]
-        plots.append(Plot(f"nees-{part}", f"Mean NEES of {part}", "s", "1", lines, bands=bounds))
-    lines = []
-    for name, (_, full) in flown.items():
-        spread, said = growth(full)
-        late = full.time >= outage[0]
-        lines += [
-            Line(f"{name}: rms", full.time[late], spread[late]),
-            Line(f"{name}: sigma", full.time[late], said[late], "--"),
-        ]
-    plots.append(Plot("outage", "Growth of the position error without GNSS", "s", "m", lines))
-    for name, (_, full) in flown.items():
-        wide = np.degrees(3.0 * full.sigma[0, :, 8])
-        shown_runs = [Line("", full.time, np.degrees(one)) for one in full.heading[:10]]
-        band = Band("3 sigma", full.time, -wide, wide)
-        plots.append(
-            Plot(f"heading-{name}", f"Heading error, {GRADES[name].name}", "s", "deg", shown_runs, bands=[band])
-        )
-    return plots
+def _accuracy(name: str, full: Runs, settled: float, outage: tuple[float, float]) -> list[Row]:
+    rows = []
+    where = f"{GRADES[name].name}, {len(full.errors)} runs"
+    window = (full.time >= settled) & (full.time <= outage[0])
+    for what, angle, limit in zip(("tilt", "heading"), (full.tilt, full.heading), LIMITS_DEG[name], strict=True):
+        rms = math.degrees(math.sqrt(float((angle[:, window] ** 2).mean())))
+        rows.append(at_most(f"{name}-{what}", f"{where}: rms of {what}", rms, "deg", limit))
+    spread, said = growth(full)
+    words = f"{where}: after {outage[1] - outage[0]:g} s without GNSS, rms of position over sigma"
+    rows.append(near(f"{name}-outage-ratio", words, spread[-1] / said[-1], "1", 0.25, reference=1.0))
+    rows.append(shown(f"{name}-outage", f"{where}: rms of position then", spread[-1], "m", reference=said[-1]))
+    gain = gains(full)[full.time <= outage[0]][-1]
+    for (id, of, unit), value in zip(GAINS, gain, strict=True):
+        rows.append(shown(f"{name}-gain-{id}", f"{where}: Kalman gain of {of} at {outage[0]:g} s", value, unit))
+    return rows

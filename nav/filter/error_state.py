@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from nav.error_dynamics import fill_dynamics, fill_input, fill_transition
-from nav.filter.states import STATES, Tuning, places
+from nav.filter.states import LEVEL, STATES, Tuning, places
 from nav.increments import FloatArray, IntArray
 from nav.kernel import kernel
 from nav.turn import matrix_from_quaternion, multiply, quaternion_of
@@ -106,6 +106,7 @@ def _predict(
     used: IntArray,
     white: FloatArray,
     by_rate: FloatArray,
+    by_force: FloatArray,
     walk: FloatArray,
     before: FloatArray,
     after: FloatArray,
@@ -138,8 +139,10 @@ def _predict(
         density = white[j] * white[j]
         if j < 3:
             for i in range(3):
-                rate = sums[1 + i] / step
-                density += by_rate[j, i] * rate * rate
+                rate, force = sums[1 + i] / step, sums[4 + i] / step
+                if i == 2:
+                    force += LEVEL
+                density += by_rate[j, i] * rate * rate + by_force[j, i] * force * force
         weight[n + j] = density * step
         for i in range(9):
             w[i, n + j] = gain[i, j]
@@ -285,7 +288,7 @@ class ErrorState:
             Its length, s, and the sums of the corrected increments, rad and m/s. A length of zero changes nothing.
         """
         t = self.tuning
-        how = self.used, t.white, t.by_rate, t.walk
+        how = self.used, t.white, t.by_rate, t.by_force, t.walk
         room = self._nine, self._gain, self.transition, self.u, self.d, self._w, self._weight
         _predict(*how, before, after, sums, self.turn, *room)
 

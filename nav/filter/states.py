@@ -6,13 +6,18 @@ what the corrected increments still err by is
 
     dw = gyro bias + gyro scale * w + misalignment w + gyro g * f,     df = accelerometer bias + accelerometer scale * f
 
-A parameter without a state is not estimated. What it would have explained becomes noise: constant at 1 g it widens the bias;
-in proportion to the rate (scale factor, misalignment) it is white noise of the density sigma^2 w^2 `TURN_S`, as sure as the
+A parameter without a state is not estimated. What it would have explained becomes noise. What is constant at 1 g widens the
+bias. What goes with the rate (scale factor, misalignment), or with the force beyond that of level flight (drift by force,
+along the input axis and the other one of its channel), is white noise of the density sigma^2 w^2 `TURN_S`, as sure as the
 parameter after a turn of that length.
 
-White noise is that of the grade. Flicker is a random walk of the bias whose Allan deviation, K sqrt(tau / 3), meets that of
-flicker, B sqrt(2 ln 2 / pi), at tau = `FLICKER_S`: no outage that is bridged is much longer, and in a shorter time white
-noise rules. Not a Gauss-Markov process: the same state holds the turn-on bias, which does not decay.
+Flicker of B has the spectrum B^2 / w at w, rad/s. It lies nowhere above that of white noise and a random walk together,
+
+    B^2 / w <= B^2 T / 2 + B^2 / (2 T w^2),
+
+and touches it at w = 1 / T. So white noise is that of the grade and B^2 T / 2, with T = `FLICKER_S`, about the time in which
+GNSS at some hertz corrects velocity and tilt; the bias walks with B / sqrt(2 T), and what is slower than T widens it at the
+start. No Gauss-Markov process: the same state holds the turn-on bias, which does not decay.
 """
 
 import math
@@ -25,6 +30,7 @@ import numpy as np
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.grades import Grade
+from nav.instruments.noise import flicker_processes
 from nav.instruments.sources import combination
 from nav.kernel import inline_kernel, kernel
 
@@ -37,9 +43,10 @@ GYRO_MISALIGNMENT = slice(29, 35)
 STATES = 35
 """Of the full set; every array of states has these places, whatever is used."""
 
-FLICKER_S = 60.0
+FLICKER_S = 10.0
 TURN_S = 10.0
-_STANDARD_G = 9.80665
+LEVEL = 9.80665
+"""Specific force of level flight, up, m/s^2."""
 
 
 class Block(Enum):
@@ -91,6 +98,8 @@ class Tuning:
         More noise of gyro i by the rate about axis j: variance density by the square of the rate, s.
     walk : (STATES,) float
         Random walks of the parameters, unit / sqrt(s).
+    by_force : (3, 3) float
+        As `by_rate`, by the force along axis j beyond that of level flight, s (rad/s / (m/s^2))^2.
 
     Raises
     ------
@@ -103,10 +112,12 @@ class Tuning:
     white: FloatArray
     by_rate: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
     walk: FloatArray = field(default_factory=lambda: np.zeros(STATES))
+    by_force: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     def __post_init__(self) -> None:
         """Refuse what would end in NaN."""
-        for name, shape in (("sigma", (STATES,)), ("white", (6,)), ("by_rate", (3, 3)), ("walk", (STATES,))):
+        shapes = {"sigma": (STATES,), "white": (6,), "by_rate": (3, 3), "walk": (STATES,), "by_force": (3, 3)}
+        for name, shape in shapes.items():
             array = np.ascontiguousarray(getattr(self, name), np.float64)
             if array.shape != shape or not (np.isfinite(array) & (array >= 0.0)).all():
                 raise HilError(f"filter tuning: {name} must be {shape} numbers, finite and not negative")
@@ -139,24 +150,34 @@ def tuning(
         Of the barometer's offset (weather), m/sqrt(s).
     """
     blocks = tuple(block for block in Block if block in set(blocks))
-    share = np.linalg.norm(combination(grade.gyro_channels), axis=1)  # channels of one axis are averaged
+    mix = combination(grade.gyro_channels) ** 2  # channels of one axis are averaged
+    share = np.sqrt(mix.sum(axis=1))
     sigma, walk = np.zeros(STATES), np.zeros(STATES)
     scale_known, g_known = Block.GYRO_SCALE in blocks, Block.GYRO_G in blocks
     bias = grade.gyro_bias_removed if bias_removed else grade.gyro_bias
-    by_force = grade.gyro_g * _STANDARD_G
-    sigma[GYRO_BIAS] = share * math.sqrt(bias**2 + (1 if g_known else 2) * by_force**2)
-    by_scale = 0.0 if Block.ACCELEROMETER_SCALE in blocks else grade.accelerometer_scale * _STANDARD_G
+    sigma[GYRO_BIAS] = share * math.sqrt(bias**2 + (1 if g_known else 2) * (grade.gyro_g * LEVEL) ** 2)
+    by_scale = 0.0 if Block.ACCELEROMETER_SCALE in blocks else grade.accelerometer_scale * LEVEL
     sigma[ACCELEROMETER_BIAS] = math.hypot(grade.accelerometer_bias, by_scale)
     sigma[GYRO_SCALE], sigma[ACCELEROMETER_SCALE] = share * grade.gyro_scale, grade.accelerometer_scale
     sigma[GYRO_G], sigma[GYRO_MISALIGNMENT] = share * grade.gyro_g, np.repeat(share, 2) * grade.gyro_misalignment
     sigma[LEVER_ARM], sigma[GNSS_DELAY], sigma[BAROMETER_BIAS] = lever_arm, delay, barometer
-    meet = math.sqrt(2.0 * math.log(2.0) / math.pi * 3.0 / FLICKER_S)
-    walk[GYRO_BIAS], walk[ACCELEROMETER_BIAS] = share * meet * grade.gyro_flicker, meet * grade.accelerometer_flicker
-    walk[BAROMETER_BIAS] = barometer_walk
+    white = np.concatenate([share * grade.gyro_white, np.full(3, grade.accelerometer_white)])
+    flicker = np.concatenate([share * grade.gyro_flicker, np.full(3, grade.accelerometer_flicker)])
+    slow, part = flicker_processes(1.0, FLICKER_S)
+    sigma[9:15] = np.hypot(sigma[9:15], part * math.sqrt(len(slow)) * flicker)
+    walk[9:15], walk[BAROMETER_BIAS] = flicker / math.sqrt(2.0 * FLICKER_S), barometer_walk
     by_rate = np.full((3, 3), 0.0 if Block.GYRO_MISALIGNMENT in blocks else grade.gyro_misalignment**2)
     np.fill_diagonal(by_rate, 0.0 if scale_known else grade.gyro_scale**2)
-    white = np.concatenate([share * grade.gyro_white, np.full(3, grade.accelerometer_white)])
-    return Tuning(blocks, sigma, white, TURN_S * (share**2)[:, None] * by_rate, walk)
+    axes = np.eye(3)[np.array(grade.gyro_channels)]
+    by_force = grade.gyro_g**2 * mix @ (axes[:, 1] + (0.0 if g_known else axes[:, 0]))
+    return Tuning(
+        blocks,
+        sigma,
+        np.hypot(white, flicker * math.sqrt(0.5 * FLICKER_S)),
+        TURN_S * (share**2)[:, None] * by_rate,
+        walk,
+        TURN_S * by_force,
+    )
 
 
 @inline_kernel

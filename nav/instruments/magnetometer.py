@@ -165,7 +165,7 @@ def from_field(flux: FloatArray, field_b: FloatArray) -> MagnetometerCalibration
         own = [3 * i, 3 * i + 1, 3 * i + 2, 9 + i]
         apart[np.ix_(own, own)] = unit * np.outer([1.0, 1.0, 1.0, size], [1.0, 1.0, 1.0, size])
     turned = np.eye(12)
-    turned[:9, :9] = -np.kron(matrix, matrix.T)
+    turned[:9, :9] = -1.0 * np.kron(matrix, matrix.T)
     return _judged(MagnetometerCalibration(matrix, hard_iron, turned @ apart @ turned.T, residual), size)
 
 
@@ -207,7 +207,7 @@ def _sizes(
     """What is left of the sizes (n,), its slopes by S and h (n, 12), and by the readings (n, 3)."""
     off = flux - hard_iron
     taken = off @ matrix.T
-    length = np.linalg.norm(taken, axis=1)
+    length: FloatArray = np.linalg.norm(taken, axis=1)
     unit = taken / length[:, None]
     through = unit @ matrix
     slope = np.hstack([np.einsum("ki,kj->kij", unit, off).reshape(-1, 9), -through])

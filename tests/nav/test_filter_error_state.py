@@ -1,6 +1,7 @@
 """The factored filter against dense matrices, over hours, and its reset."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,8 +15,12 @@ from nav.error_dynamics import fill_dynamics, fill_input, fill_transition
 from nav.errors import HilError
 from nav.filter.error_state import ErrorState
 from nav.filter.health import quantile
-from nav.filter.states import STATES, Block, Tuning, correct_increments, places, tuning
+from nav.filter.states import STATES, TURN_S, Block, Tuning, correct_increments, places, tuning
+from nav.instruments.channels import TRIAD
 from nav.instruments.grades import GRADES
+from nav.instruments.gyro_errors import Gyros
+from nav.instruments.noise import flicker_processes
+from nav.instruments.sources import combination
 
 SIGMA = np.array([5.0, 5.0, 5.0, 0.3, 0.3, 0.3, 1e-3, 1e-3, 1e-2])
 Q_NB = Rotation.from_euler("ZYX", [40.0, 5.0, -10.0], degrees=True).as_quat(scalar_first=True)
@@ -59,7 +64,7 @@ def dense(tuning, before, after, sums, turn):
     noise = np.diag(tuning.walk**2 * step)
     noise[:9, :9] = 0.0
     density = tuning.white**2
-    density[:3] += tuning.by_rate @ w**2
+    density[:3] += tuning.by_rate @ w**2 + tuning.by_force @ np.square(f + np.array([0.0, 0.0, 9.80665]))
     noise[:9, :9] += step * (gain * density) @ gain.T
     return phi[np.ix_(used, used)], noise[np.ix_(used, used)]
 
@@ -164,6 +169,42 @@ def test_an_interval_of_no_length_changes_nothing():
     p = state.covariance
     state.predict(before, after, np.zeros(7))
     assert (state.covariance == p).all()
+
+
+@pytest.mark.parametrize("name", GRADES)
+def test_the_noise_covers_the_spectrum_of_flicker(name):
+    """Of the simulated flicker, its ripple aside, at every frequency; and no more than it where they touch."""
+    grade = replace(GRADES[name], gyro_white=0.0, accelerometer_white=0.0, gyro_channels=TRIAD)
+    believed, w = tuning(grade), np.geomspace(1e-4, 100.0, 300)
+    for place, flicker in (0, grade.gyro_flicker), (3, grade.accelerometer_flicker):
+        times, part = flicker_processes(flicker, 0.001)
+        simulated = (2.0 * part**2 * times / (1.0 + np.outer(w, times) ** 2)).sum(axis=1)
+        said = believed.white[place] ** 2 + (believed.walk[9 + place] / w) ** 2
+        assert (said > 0.95 * simulated).all()
+        assert (said / simulated).min() < 1.05
+
+
+@pytest.mark.parametrize("name", GRADES)
+def test_drift_by_force_is_expected_as_the_gyros_have_it(name):
+    """In a pull-up of `TURN_S`: how far it turns the attitude beyond what it does in level flight."""
+    grade, level, pulled = GRADES[name], np.array([0.0, 0.0, -9.80665]), np.array([3.0, -2.0, -14.0])
+    rng = np.random.default_rng(1)
+
+    def drift(errors):
+        angles = [
+            Gyros(errors, TURN_S, np.random.default_rng(0)).sense(np.zeros((1, 3)), TURN_S * force[None])[0]
+            for force in (pulled, level)
+        ]
+        return combination(grade.gyro_channels) @ (angles[0] - angles[1])
+
+    def variance(force):
+        state, solution = ErrorState(tuning(grade)), np.array([LAT, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+        state.start(np.zeros(9))
+        state.predict(solution, solution, TURN_S * np.array([1.0, 0.0, 0.0, 0.0, *force]))
+        return np.diag(state.covariance)[6:9]
+
+    drawn = np.array([drift(grade.draw(rng)[0]) for _ in range(1000)])
+    np.testing.assert_allclose(np.sqrt(variance(pulled) - variance(level)), drawn.std(axis=0), rtol=0.1)
 
 
 @given(st.integers(0, 100))
