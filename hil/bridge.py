@@ -14,7 +14,7 @@ import hashlib
 import math
 import signal
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -24,36 +24,27 @@ from numpy.typing import NDArray
 
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, is_aiding
-from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from drivers.can.frames import FrameArray, frames
 from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
 from hil.control import Control
-from hil.magnetic import magnetic_field
 from hil.magnetometer import correct
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
+from hil.settings import settings_of
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
-from hil.world.instruments import axis_drift, head_model, mounting, sensors_of
+from hil.world.instruments import head_model
 from hil.world.truth import TruthKeeper
 from nav.aiding import Kind
-from nav.alignment.rest import UNSTATED
 from nav.errors import HilError
-from nav.filter.aided import Settings as FilterSettings
-from nav.filter.assumptions import Assumptions, Bounds
 from nav.filter.record import Recorder
-from nav.filter.states import GYRO_BIAS, SENSOR_BLOCKS, Block, Tuning, tuning
-from nav.filter.stillness import Stillness
-from nav.gaps import GapPolicy
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
-from nav.instruments.axis_drift import body_drift
-from nav.instruments.grades import GRADES
 from nav.instruments.head import HeadCombiner
-from nav.navigator import Aiding, Navigator, Settings
+from nav.navigator import Navigator
 from nav.state import HOST_FIELDS, NAV_STATE
 
 BATCH = 1024
@@ -62,8 +53,6 @@ TICK_S = 0.02
 """Longest wait for a frame."""
 AIDING_FAULTS = ("lost", "duplicated", "crc_errors", "foreign", "short", "version_errors", "restarts")
 """Counters of aiding frames that the summary shows."""
-BAROMETER_M = 1000.0
-"""How far a pressure height may be from the ellipsoid at first, one sigma: it is that above some field, on some day."""
 EVENTS = np.dtype([("time", "<f8"), ("severity", "S8"), ("text", "S240"), ("station", "?")])
 """A message for the user, as it lies in the ring of events."""
 
@@ -118,95 +107,6 @@ class Outlets:
             Ring(FRAME, 1024, 0),
             recording=recording,
         )
-
-
-def settings_of(scenario: Scenario) -> Settings:
-    """The navigator's settings in a scenario."""
-    navigation, start, motion = scenario.navigation, scenario.navigation.start, scenario.motion
-    latitude = motion.latitude_deg if start.latitude_deg is None else start.latitude_deg
-    longitude = motion.longitude_deg if start.longitude_deg is None else start.longitude_deg
-    return Settings(
-        lat=math.radians(latitude),
-        lon=math.radians(longitude),
-        height=motion.height_m if start.height_m is None else start.height_m,
-        alignment="gyrocompass" if navigation.alignment == "truth" else navigation.alignment,
-        align_s=navigation.align_s,
-        heading=None if start.heading_deg is None else math.radians(start.heading_deg),
-        sensors=UNSTATED if navigation.alignment == "truth" else sensors_of(scenario),
-        sway=navigation.sway_m,
-        track_bias_at_rest=navigation.track_bias_at_rest,
-        position_trusted=navigation.alignment != "level",
-        attitude=navigation.attitude,
-        mechanization=navigation.mechanization,
-        gravity=navigation.gravity,
-        lever_arm=scenario.head.lever_arm_m,
-        antenna=antenna_of(scenario),
-        gaps=GapPolicy(navigation.gap_interpolate_s, navigation.gap_realign_s),
-        aiding=aiding_of(scenario, math.radians(latitude), math.radians(longitude)) if navigation.aided else None,
-    )
-
-
-def antenna_of(scenario: Scenario) -> tuple[float, float, float]:
-    """From the head to the first receiver's antenna, m."""
-    gnss = scenario.aiding.gnss
-    return _three(np.subtract(gnss[0].lever_arm_m, scenario.head.lever_arm_m) if gnss else np.zeros(3))
-
-
-def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
-    """How the filter of a scenario is set."""
-    head, aiding, height = scenario.head, scenario.aiding, scenario.motion.height_m
-    chosen, start = scenario.navigation.filter, scenario.navigation.start
-    grade = GRADES[chosen.grade or ("dtg" if head.grade == "none" else head.grade)]
-    if chosen.gyro_deg_sqrt_h is not None:
-        grade = replace(grade, gyro_white=math.radians(chosen.gyro_deg_sqrt_h) / 60.0)
-    if chosen.accelerometer_ms_sqrt_h is not None:
-        grade = replace(grade, accelerometer_white=chosen.accelerometer_ms_sqrt_h / 60.0)
-    tilt = max(math.radians(0.01), grade.accelerometer_bias / 9.80665)
-    removed = scenario.navigation.alignment not in ("moving", "transfer")
-    field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
-    if chosen.declination_deg is not None:
-        there, level = math.radians(chosen.declination_deg), math.hypot(field_n[0], field_n[1])
-        field_n[:2] = level * math.cos(there), level * math.sin(there)
-    believed = tuning(
-        grade,
-        (*SENSOR_BLOCKS, Block.BAROMETER_BIAS),
-        bias_removed=removed,
-        barometer=BAROMETER_M,
-        barometer_walk=chosen.barometer_m_sqrt_s,
-    )
-    variances = axis_drift(head, bias_removed=removed)
-    if scenario.driver == "dtg-head" and variances is not None:
-        believed.sigma[GYRO_BIAS] = body_drift(variances, mounting(head), math.radians(head.skew_deg))
-    assumptions = _assumptions_of(scenario, believed)
-    if (
-        assumptions is not None
-    ):  # what is measured at rest ties the tilt to the accelerometers' biases: they are its doubt
-        tilt *= 10.0
-    return Aiding(
-        believed,
-        FilterSettings(
-            lever_arm=antenna_of(scenario), field_n=_three(field_n), magnetic_heading=chosen.magnetic == "heading"
-        ),
-        np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, tilt, tilt, math.radians(start.heading_sigma_deg)]),
-        assumptions,
-    )
-
-
-def _assumptions_of(scenario: Scenario, believed: Tuning) -> Assumptions | None:
-    assume, bounds = scenario.navigation.assume, scenario.navigation.assume.bounds
-    if assume.rest == "never" and bounds is None:
-        return None
-    rate_white, force_white = float(believed.white[:3].max()), float(believed.white[3:].max())
-    return Assumptions(
-        Stillness(rate_white, force_white, ANGLE_LSB, VELOCITY_LSB[scenario.head.layout]),
-        assume.rest == "detected",
-        assume.smooth_ms,
-        None if bounds is None else Bounds(bounds.acceleration_ms2, bounds.speed_ms, bounds.place_m),
-    )
-
-
-def _three(vector: NDArray[np.float64]) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
 
 
 class Loop:

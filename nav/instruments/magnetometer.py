@@ -207,7 +207,7 @@ def _sizes(
     """What is left of the sizes (n,), its slopes by S and h (n, 12), and by the readings (n, 3)."""
     off = flux - hard_iron
     taken = off @ matrix.T
-    length: FloatArray = np.linalg.norm(taken, axis=1)
+    length: FloatArray = np.sqrt(np.sum(taken**2, axis=1))
     unit = taken / length[:, None]
     through = unit @ matrix
     slope = np.hstack([np.einsum("ki,kj->kij", unit, off).reshape(-1, 9), -through])
@@ -216,7 +216,7 @@ def _sizes(
 
 def _solved(rows: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The step of Gauss-Newton, and the normal matrix."""
-    step: FloatArray = np.linalg.lstsq(rows, left, rcond=None)[0]
+    step = np.asarray(np.linalg.lstsq(rows, left, rcond=None)[0], float)
     return step, rows.T @ rows
 
 

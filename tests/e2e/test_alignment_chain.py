@@ -4,9 +4,9 @@ import math
 
 import pytest
 
-from hil.bridge import settings_of
 from hil.pytest_plugin import StartBridge
 from hil.scenario import load
+from hil.settings import settings_of
 from nav.alignment.chain import heading_limit
 from nav.errors import HilError
 
