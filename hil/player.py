@@ -37,6 +37,8 @@ MAGNETIC_SIGMA_DEG = 8.0
 """Of a heading by an undisturbed magnetometer of a small vehicle."""
 SHAKEN_S = 5.0
 """How long the error lasts that vibration makes in an accelerometer (rectified, folded): noise of that correlation time."""
+HAND = {"acceleration_ms2": 0.3, "speed_ms": 1.0, "place_m": 10.0}
+"""What a board without a receiver does, on a desk or in a hand."""
 SLOW_S = 1.0
 CHUNK = 256
 _IMU_LOGS: dict[str, Callable[[Path], ImuLog]] = {
@@ -119,6 +121,7 @@ def _board_scenario(path: Path, log: ImuLog) -> Scenario:
                 "start": start,
                 "track_bias_at_rest": len(log.aiding) == 0,
                 "aided": len(log.aiding) > 0,
+                "assume": {} if log.place is not None or not len(log.aiding) else {"rest": "detected", "bounds": HAND},
                 "filter": {
                     "grade": "mems",
                     "gyro_deg_sqrt_h": max(math.degrees(log.shake(log.rate) * math.sqrt(period_s)) * 60.0, 0.3),
