@@ -37,7 +37,7 @@ MAGNETIC_SIGMA_DEG = 8.0
 """Of a heading by an undisturbed magnetometer of a small vehicle."""
 SHAKEN_S = 5.0
 """How long the error lasts that vibration makes in an accelerometer (rectified, folded): noise of that correlation time."""
-HAND = {"acceleration_ms2": 0.3, "speed_ms": 1.0, "place_m": 10.0}
+HAND = {"acceleration_ms2": 0.3, "speed_ms": 0.3, "place_m": 1.0}
 """What a board without a receiver does, on a desk or in a hand."""
 SLOW_S = 1.0
 CHUNK = 256

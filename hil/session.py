@@ -37,6 +37,8 @@ RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
+BUSY_NS = 500_000_000
+"""A loop that has not asked for frames for so long is busy with those that it has."""
 DRAIN_S = 1.0
 """Time for the loop to take what is on its way when the feeder has ended; as fast as it goes, time without a new frame."""
 
@@ -179,7 +181,8 @@ class Session:
         feeder = self._parts.get("feeder")
         if feeder is not None and not feeder.process.is_alive():
             frames = self.outlets.stats["frames"]
-            if self._feeder_ended is None or (not self.order.paced and frames != self._drained):
+            at_work = frames != self._drained or time.monotonic_ns() - self.outlets.stats["beat_ns"] > BUSY_NS
+            if self._feeder_ended is None or (not self.order.paced and at_work):
                 self._feeder_ended, self._drained = time.monotonic(), frames
             if time.monotonic() - self._feeder_ended > DRAIN_S:
                 self.stop()

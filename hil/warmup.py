@@ -4,11 +4,17 @@ The first time on a machine this takes up to a minute; afterwards the compiled k
 """
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hil.ring import Ring
 from hil.scenario import Scenario
-from nav.state import NAV_STATE
+from nav.aiding import Kind, aiding_rows
+from nav.state import NAV_STATE, Mode
+
+if TYPE_CHECKING:
+    from hil.bridge import Loop
 
 STEPS = 5
 """Steps that each of the two functions here reports."""
@@ -25,9 +31,27 @@ def _miniature(scenario: Scenario) -> Scenario:
             "head": head,
             "aiding": scenario.aiding.model_dump(),
             "motion": {"rest_s": 1.0, "ramp_s": 0.5, "north": {"rate": 1.0}},
-            "navigation": {"alignment": "level", "align_s": 0.5, "start": {"heading_deg": 0.0}},
+            "navigation": {
+                "alignment": "level",
+                "align_s": 0.5,
+                "start": {"heading_deg": 0.0},
+                "aided": scenario.navigation.aided,
+                "assume": scenario.navigation.assume.model_dump(),
+                "filter": scenario.navigation.filter.model_dump(),
+            },
         }
     )
+
+
+def _aid(loop: "Loop", states: Ring) -> None:
+    """A measurement of every kind, true of no matter what."""
+    row = np.zeros(1, NAV_STATE)
+    if not states.latest(row) or row["mode"][0] != Mode.NAVIGATE:
+        return
+    time, place, q_nb = float(row["time"][0]), row[["lat", "lon", "height"]][0], row["q_nb"][0]
+    values = {Kind.GNSS: (*place, 0.0, 0.0, 0.0), Kind.MAGNETIC: (2e-5, 0.0, 4e-5), Kind.ATTITUDE: tuple(q_nb)}
+    for kind in Kind:
+        loop.navigator.aid(aiding_rows([time], kind, [values.get(kind, (0.0, 0.0, 0.0))], [100.0] * 6))
 
 
 def warm_head(scenario: Scenario, report: Report) -> None:
@@ -60,6 +84,7 @@ def warm_loop(scenario: Scenario, report: Report) -> None:
             if len(slow):
                 loop.take(slow)
             loop.take(batch)
+            _aid(loop, outlets.states)
             report(3)
     outlets.states.latest(np.zeros(1, NAV_STATE))
     report(4)
