@@ -165,7 +165,7 @@ def from_field(flux: FloatArray, field_b: FloatArray) -> MagnetometerCalibration
         own = [3 * i, 3 * i + 1, 3 * i + 2, 9 + i]
         apart[np.ix_(own, own)] = unit * np.outer([1.0, 1.0, 1.0, size], [1.0, 1.0, 1.0, size])
     turned = np.eye(12)
-    turned[:9, :9] = -1.0 * np.kron(matrix, matrix.T)
+    turned[:9, :9] = np.kron(-matrix, matrix.T)
     return _judged(MagnetometerCalibration(matrix, hard_iron, turned @ apart @ turned.T, residual), size)
 
 
@@ -216,8 +216,7 @@ def _sizes(
 
 def _solved(rows: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
     """The step of Gauss-Newton, and the normal matrix."""
-    step = np.asarray(np.linalg.lstsq(rows, left, rcond=None)[0], float)
-    return step, rows.T @ rows
+    return np.asarray(np.linalg.lstsq(rows, left, rcond=None)[0], np.float64), rows.T @ rows
 
 
 def _inverse(normal: FloatArray) -> FloatArray:

@@ -35,7 +35,8 @@ PARTS = (("tilt", "deg"), ("heading", "deg"), ("velocity", "m/s"), ("position", 
 _UNITS = np.array([math.pi / 180.0, math.pi / 180.0, 1.0, 1.0])
 MARGIN = 1.25
 """With white noise the filter with antennas may err so much more than the best tracking correction: there are few runs."""
-TIMED_S = 20.0
+TIMED_S, PEER_S = 20.0, 120.0
+"""Flights on which the time is taken, and pyins flies: minutes."""
 
 
 def navigate(flight: Flight, grade: Grade, way: str) -> FloatArray:
@@ -48,7 +49,12 @@ def navigate(flight: Flight, grade: Grade, way: str) -> FloatArray:
     return track(flight, Gains(constant, constant, constant, constant))
 
 
-def run(seeds: int = SEEDS, settled: float = SETTLED_S, outage: tuple[float, float] = OUTAGE_S) -> Study:
+def run(
+    seeds: int = SEEDS,
+    settled: float = SETTLED_S,
+    outage: tuple[float, float] = OUTAGE_S,
+    peer_s: float = PEER_S,
+) -> Study:
     """All of it; some minutes."""
     rows: list[Row] = []
     plots: list[Plot] = []
@@ -61,7 +67,7 @@ def run(seeds: int = SEEDS, settled: float = SETTLED_S, outage: tuple[float, flo
             late = {way: errors[:, _time(errors) >= settled] for way, errors in _runs(grade, seeds, draw).items()}
             where = f"{grade.name}, {motion}, slow error of GNSS, {seeds} runs"
             rows += _settled(f"{name}-{motion}-wander", where, late, math.inf)
-    rows += [*_times(), *peer.rows()]
+    rows += [*_times(), *peer.rows(peer_s)]
     about = (
         "Straight: level at 70 m/s. Turns: circles and straights at 35 to 80 m/s. Increments at 50 Hz by the table of "
         "grades, GNSS and four antennas (2 m, 5 mm) at 5 Hz, 1.5 m (2.5 m vertical) and 0.05 m/s (0.08), all started in "

@@ -27,27 +27,26 @@ from nav.increments import FloatArray
 from nav.instruments.grades import GRADES
 from nav.rotation import euler_from_quaternion, quaternion_from_euler
 
-LENGTH_S, SETTLED_S = 120.0, 60.0
 PARTS = (("tilt", "deg"), ("heading", "deg"), ("velocity", "m/s"), ("position", "m"))
 _UNITS = np.array([math.pi / 180.0, math.pi / 180.0, 1.0, 1.0])
 
 
-def rows() -> list[Row]:
-    """Errors and times of both filters, GNSS alone, a flight with turns: pyins takes minutes for it."""
+def rows(length: float) -> list[Row]:
+    """Errors and times of both filters, GNSS alone, a flight with turns of `length` s, judged from its middle on."""
     if find_spec("pyins") is None or find_spec("pandas") is None:
         return []
     found: list[Row] = []
     for name, grade in GRADES.items():
         belief, squares, cost = tuning(grade, bias_removed=True), np.zeros((2, 4)), np.zeros(2)
-        flight = fly("turns", grade, 0, LENGTH_S, None, wandering=False)
-        late = flight.truth["time"][1:] >= SETTLED_S
+        flight = fly("turns", grade, 0, length, None, wandering=False)
+        late = flight.truth["time"][1:] >= 0.5 * length
         for k, solve in enumerate((_ours, feedback)):
             began = time.thread_time()
             solved = solve(flight, belief)
             cost[k] = time.thread_time() - began
             squares[k] = (flight.errors(solved)[late] ** 2).mean(axis=0)
         ours, theirs = np.sqrt(squares) / _UNITS
-        where = f"{grade.name}, turns, one run of {LENGTH_S:g} s, GNSS alone, 27 states"
+        where = f"{grade.name}, turns, one run of {length:g} s, GNSS alone, 27 states"
         for (part, unit), mine, other in zip(PARTS, ours, theirs, strict=True):
             words = f"{where}: {part}, rms (reference: pyins)"
             found.append(shown(f"pyins-{name}-{part}", words, mine, unit, reference=other))

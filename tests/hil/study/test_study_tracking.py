@@ -70,7 +70,7 @@ def test_the_peer_navigates_as_ours_does():
 
 
 def test_rows_and_figures(tmp_path):
-    found = run(seeds=1, settled=1.0, outage=(2.0, 4.0))
+    found = run(seeds=1, settled=1.0, outage=(2.0, 4.0), peer_s=2.0)
     ids = [row.id for row in found.rows]
     assert len(set(ids)) == len(ids)
     assert {f"time-{way}" for way in WAYS} <= set(ids)
