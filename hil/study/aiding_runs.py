@@ -50,13 +50,23 @@ class Runs:
     nis: FloatArray
     gain: FloatArray
 
-    def inside(self, since: float, until: float, *, upper_only: bool = False) -> FloatArray:
-        """(3,): share of the epochs `since` to `until`, s, whose NEES, averaged over the runs, is inside its 95 % bounds."""
-        runs = len(self.errors)
-        mean = self.nees[:, (self.time >= since) & (self.time <= until)].mean(axis=0)
-        low, high = nees_bounds(runs)
+    def inside(self, since: float, until: float, campaign: int, *, upper_only: bool = False) -> FloatArray:
+        """(3,): share of the epochs whose NEES, averaged over a campaign, is inside its 95 % bounds.
+
+        Parameters
+        ----------
+        since, until : float
+            s.
+        campaign : int
+            Runs of each campaign, which must go into the runs there are; the share is that of all campaigns.
+        upper_only : bool
+            Only the upper bound counts.
+        """
+        chosen = self.nees[:, (self.time >= since) & (self.time <= until)]
+        mean = chosen.reshape(-1, campaign, *chosen.shape[1:]).mean(axis=1)
+        low, high = nees_bounds(campaign)
         good = mean <= high if upper_only else (mean >= low) & (mean <= high)
-        return np.asarray(good.mean(axis=0), np.float64)
+        return np.asarray(good.mean(axis=(0, 1)), np.float64)
 
 
 def nees_bounds(runs: int) -> tuple[float, float]:
