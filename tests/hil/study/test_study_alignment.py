@@ -43,7 +43,7 @@ def test_rows_and_figures():
 
 
 def test_the_filter_goes_on_where_the_coarse_alignment_ends():
-    """From a heading of the wrong minute's sway to that of theory: the filter's error is within its sigma, and below before."""
+    """A minute of sway shows degrees; the filter comes to tenths, and errs within its sigma."""
     found = moored("dtg", 1, 300.0)
     heading, sigma = np.abs(found.errors[0, :, 1]), found.sigmas[0, :, 1]
     assert sigma[-1] < 0.002 < sigma[6]
