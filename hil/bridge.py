@@ -136,7 +136,7 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
     believed = tuning(grade, (*SENSOR_BLOCKS, Block.BAROMETER_BIAS), bias_removed=True)
     assumptions, tilt = _assumptions_of(scenario, believed), math.radians(0.01)
-    if assumptions is not None:  # what is measured at rest ties the tilt to the accelerometers' biases, which alone are its doubt
+    if assumptions is not None:  # rest ties the tilt to the accelerometers' biases: their doubt is to be the only one
         tilt = max(tilt, 10.0 * grade.accelerometer_bias / 9.80665)
     return Aiding(
         believed,
