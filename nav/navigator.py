@@ -149,8 +149,9 @@ class Navigator:
 
         None where there is no filter or it has not started.
         """
-        started = self._aided is not None and self._aided.time > -math.inf
-        return self._aided.sigma[:9] if self._aided is not None and started else None
+        if self._aided is None or self._aided.time == -math.inf:
+            return None
+        return self._aided.sigma[:9]
 
     def events(self) -> list[Event]:
         """What happened since the last call."""
