@@ -8,18 +8,19 @@ more than that; in sigmas of the filter and of the window, `SURE` of them:
 
     rate      of the window's mean, corrected, is the Earth's: no turn
     force     of the window's mean, corrected, is 1 g long: no coordinated turn
-    velocity  the filter's is zero, and it is known to be below `smooth`: what may have been flying for a minute since the last fix,
-              its velocity lost, is not taken for a body at rest
+    velocity  the filter's is zero, and known to be below `smooth`: what may have been flying since the last fix, its velocity
+              lost, is not taken for a body at rest
 
-Then the velocity is zero (`TREMOR_MS`) and the body turns with the Earth alone. Sigmas hold what the blocks in the window scatter by.
-The two take turns, stride by stride, so that each is judged with what the other has corrected.
+Then the velocity is zero (`TREMOR_MS`) and the body turns with the Earth alone. Sigmas hold what the blocks in the window
+scatter by. The two take turns, stride by stride, so that each is judged with what the other has corrected.
 
 *Bounds*, for attitude and heading without a receiver: the vehicle accelerates by `acceleration` at random, is about as fast as
-`speed` and about as far as `place` from where it started. Each is a Gauss-Markov process: the acceleration lasts speed / acceleration, the velocity place / speed,
-the place as long. A row each T of such a process with deviation s and correlation time tau is given the white noise of the same
-power at low frequencies, s sqrt(2 tau / T): rows one after another do not pretend to be independent news. The acceleration's is the
-vertical, `Kind.GRAVITY`. In a manoeuvre it weighs less: s^2 grows by the squares of what the force differs from 1 g in length, of what it scatters by
-within the window (jerk), and of rate times `speed` (the turn). At rest it says nothing new and is left out, as is the velocity's.
+`speed` and about as far as `place` from where it started. Each is a Gauss-Markov process: the acceleration lasts
+speed / acceleration, velocity and place last place / speed. A row each T of such a process with deviation s and correlation time
+tau is given the white noise of the same power at low frequencies, s sqrt(2 tau / T): rows one after another do not pretend to be
+independent news. The acceleration's is the vertical, `Kind.GRAVITY`. In a manoeuvre it weighs less: s^2 grows by the squares of
+what the force differs from 1 g in length, of what it scatters by within the window (jerk), and of rate times `speed` (the turn).
+At rest it says nothing new and is left out, as is the velocity's.
 """
 
 import math
@@ -147,7 +148,10 @@ class Assumed:
 def _manoeuvre(
     estimates: FloatArray, solution: FloatArray, mean: FloatArray, rate: FloatArray, force: FloatArray
 ) -> tuple[float, float]:
-    """By how much the force of a mean (6,) is longer than gravity, m/s^2, and its rate, rad/s; both corrected, and left in the last two."""
+    """By how much the force of a mean (6,) is longer than gravity, m/s^2, and how large its rate is, rad/s.
+
+    Both are corrected, and left in `rate` and `force` (3,).
+    """
     correct_one(estimates, 1.0, mean[:3], mean[3:], rate, force)
     length = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
     turn = math.sqrt(rate[0] * rate[0] + rate[1] * rate[1] + rate[2] * rate[2])
