@@ -89,7 +89,7 @@ class Settings:
     track_bias_at_rest : bool
         Keep averaging the gyro bias at rest.
     position_trusted : bool
-        False marks the solution `Health.UNAIDED`.
+        False marks the solution `Health.UNAIDED`, but where a receiver's fixes hold it.
     lever_arm : tuple of float
         From the navigated point to the sensor, body axes, m. What goes in and out is the navigated point.
     antenna : tuple of float
@@ -353,6 +353,8 @@ class Navigator:
         event = 0
         if self._watch is not None:
             stop = start + self._watch.part(imu.time[start:stop])
+            if not self.settings.position_trusted:
+                self.health = self.health & ~Health.UNAIDED | (Health.GOOD if self._watch.fixed else Health.UNAIDED)
             for note in self._watch.notes():
                 self.tell(note.time, "warning" if note.bad else "notice", note.text, station=True)
         if self._assumed is not None:

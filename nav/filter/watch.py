@@ -19,6 +19,7 @@ FRESH_S = 5.0
 """An older measurement says nothing of the present, s."""
 STREAK = 3
 """A source is rejected, or taken again, when so many of its measurements in a row are: a single one may be chance."""
+SURE_M = 100.0
 NOISY = 4.0
 """The stated variance is multiplied by so much when a source is called noisy: its noise is twice what it says."""
 
@@ -66,6 +67,8 @@ class Watch:
     ratio : (len(Ratio),) float32
         Innovation over its gate, of the sources of the last `FRESH_S` the one that fits worst; 0 without one. A measurement
         that was rejected has 1 and more.
+    fixed : bool
+        A receiver's position has been taken, and the level position is as sure as `SURE_M` still.
     """
 
     def __init__(self, aided: AidedNavigator) -> None:
@@ -74,6 +77,7 @@ class Watch:
         self._sources: dict[tuple[Channel, int], _Source] = {}
         self._notes: list[Note] = []
         self._next = -math.inf
+        self.fixed = False
         self.sigma, self.ratio = np.full(9, np.inf, np.float32), np.zeros(len(Ratio), np.float32)
 
     def start(self) -> None:
@@ -81,6 +85,7 @@ class Watch:
         self._sources.clear()
         self._next = -math.inf
         self.sigma[:], self.ratio[:] = self._aided.sigma[:9], 0.0
+        self.fixed = False
 
     def notes(self) -> list[Note]:
         """What has become of the sources since the last call."""
@@ -104,8 +109,11 @@ class Watch:
         for (channel, _), source in self._sources.items():
             if time - source.time <= FRESH_S:
                 self.ratio[_RATIOS[channel]] = max(self.ratio[_RATIOS[channel]], source.ratio)
+        taken = False
         for found in self._aided.health:
+            taken = taken or (found.channel == Channel.GNSS_POSITION and found.accepted > 0)
             self._tell(found)
+        self.fixed = bool((self.fixed or taken) and np.hypot(self.sigma[0], self.sigma[1]) < SURE_M)
 
     def _note(self, one: Judged) -> None:
         source = self._sources.setdefault((one.channel, one.source), _Source())

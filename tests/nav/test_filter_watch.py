@@ -9,13 +9,14 @@ import pytest
 from hil.geometry import position_error
 from hil.study.aiding import gnss_rows, record
 from hil.study.navigation.flights import flight
+from nav.filter import watch
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.health import quantile
 from nav.filter.states import tuning
 from nav.instruments.grades import GRADES
 from nav.navigator import Aiding, Navigator, Settings
 from nav.rotation import attitude_error
-from nav.state import Mode, Ratio
+from nav.state import Health, Mode, Ratio
 
 MOTION = flight("smooth")
 SECONDS = 40.0
@@ -153,3 +154,19 @@ def test_a_slow_drift_is_named():
     spoiled["value"][:, 0] += north(0.3) * late
     _, events = fly(spoiled, found=navigator(restart_s=math.inf))
     assert "GNSS position 0 is rejected: it pulls one way" in [event.text for event in events]
+
+
+def test_a_position_that_nobody_vouches_for_is_trusted_while_fixes_hold_it(monkeypatch):
+    monkeypatch.setattr(watch, "SURE_M", 20.0)
+    aiding = Aiding(tuning(GRADES["mems"], bias_removed=True), FilterSettings(), SIGMA)
+    found = Navigator(Settings(aiding=aiding, position_trusted=False))
+    start = MOTION.truth([0.0])[0]
+    found.begin(start["lat"], start["lon"], start["height"], start["vel_n"], start["q_nb"], 0.0)
+    fixes = rows()
+    states, _ = fly(fixes[(fixes["time"] > 5.0) & (fixes["time"] < 8.0)], found=found)
+    unaided = (states["health"] & Health.UNAIDED) != 0
+    level = np.hypot(states["sigma"][:, 0], states["sigma"][:, 1])
+    assert unaided[states["time"] < 5.0].all()
+    assert not unaided[(states["time"] > 5.5) & (level < 19.0)].any()
+    assert unaided[level > 22.0].all()
+    assert level[-1] > 22.0, "the fixes have been over for long enough"
