@@ -29,7 +29,7 @@ class Trace:
         good = rows[rows["mode"] >= Mode.NAVIGATE]
         self.times.append(good["time"].copy())
         self.attitudes.append(good["q_nb"].copy())
-        self.places.append(np.stack([good["lat"], good["lon"], good["height"]], axis=1))
+        self.places.append(np.column_stack([good["lat"], good["lon"], good["height"], good["sigma"][:, :3]]))
 
     def arrays(self) -> tuple[FloatArray, FloatArray]:
         """(n,) times and (n, 4) attitudes."""
@@ -64,7 +64,8 @@ class Reference:
     def differences(self, trace: Trace) -> dict[str, Any]:
         """``difference`` of our attitude and ``baseline`` of plain gyro integration, from `SETTLE_S` on, degrees.
 
-        With fixes, ``difference`` has that of our position from all of them too, also from those that were withheld.
+        With fixes, ``difference`` has that of our position from all of them too, also from those that were withheld; and
+        ``position_sigma``, the same of each axis over what the filter and the receiver say of it.
         """
         times, attitudes = trace.arrays() if trace.times else (np.zeros(0), np.zeros((0, 4)))
         difference = self._compare(times, attitudes)
@@ -101,11 +102,16 @@ class Reference:
         fixes = self.fixes[(at >= max(self.start + SETTLE_S, times[0])) & (at <= times[-1])]
         if not len(fixes):
             return {}
-        lat, lon, height = (np.interp(fixes["time"], times, places[:, i]) for i in range(3))
+        lat, lon, height, *sigma = (np.interp(fixes["time"], times, column) for column in places.T)
         track = dict(zip(("lat", "lon", "height"), fixes["value"][:, :3].T, strict=True))
         error = position_error(lat, lon, height, track)
+        parts = {"horizontal_m": np.hypot(error[:, 0], error[:, 1]), "vertical_m": error[:, 2]}
+        known = np.isfinite(sigma).all(axis=0)
+        if known.any():
+            expected = np.hypot(np.stack(sigma, axis=1), fixes["sigma"][:, :3])
+            parts["position_sigma"] = (error / expected)[known].ravel()
         result = {}
-        for name, values in (("horizontal_m", np.hypot(error[:, 0], error[:, 1])), ("vertical_m", error[:, 2])):
+        for name, values in parts.items():
             spread = Spread()
             spread.add(np.ascontiguousarray(values))
             result[name] = spread.as_dict()

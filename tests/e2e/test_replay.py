@@ -274,6 +274,18 @@ def test_a_flight(hil_data: Path, tmp_path: Path) -> None:
     assert (again["aiding"], again["navigation_digest"]) == (summary["aiding"], summary["navigation_digest"])
 
 
+@pytest.mark.parametrize("start_s", [50, pytest.param(230, marks=pytest.mark.study)])
+def test_a_flight_whose_receiver_falls_silent(hil_data: Path, start_s: int) -> None:
+    """GPS withheld for 20 s: the filter knows how far off it may be."""
+    outage = f"gnss:{start_s}:{start_s + 20}"
+    summary, _ = replay(hil_data / "ardupilot_copter.bin", "--speed", "max", "--withhold", outage)
+    difference = summary["difference"]
+    print(difference)
+    assert summary["withheld"] >= 90
+    assert difference["horizontal_m"]["max"] > 3.0, "it does drift"
+    assert difference["position_sigma"]["max"] <= 3.0
+
+
 def test_plot_needs_an_attitude_to_compare_with(recorded: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     _, said = replay(recorded[0], "--speed", "max", "--plot", tmp_path / "x.svg", code=2)
     assert "carries no attitude to compare with" in said
