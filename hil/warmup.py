@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from drivers import emulator_names
 from hil.scenario import Scenario
 from nav.state import NAV_STATE
 
@@ -17,9 +18,13 @@ Report = Callable[[int], None]
 
 def _miniature(scenario: Scenario) -> Scenario:
     head = {**scenario.head.model_dump(), "rate_hz": 200.0}
+    driver = scenario.driver if scenario.driver.partition("@")[0] in emulator_names() else "dtg-head"
+    if driver != "dtg-head":
+        head |= {"instruments": "ideal", "faults": ()}
     return Scenario.model_validate(
         {
             "bus": "unix:none",
+            "driver": driver,
             "duration_s": 1.5,
             "head": head,
             "aiding": scenario.aiding.model_dump(),
