@@ -97,7 +97,7 @@ class J1939Imu:
     Parameters
     ----------
     option : str
-        What follows ``@`` in the name of the driver: the node's source address (``226``, ``0xE2``), ``z-up``, or both with a comma.
+        What follows ``@`` in the driver's name: the node's source address (``226``, ``0xE2``), ``z-up``, or both with a comma.
 
     Raises
     ------

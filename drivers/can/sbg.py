@@ -43,8 +43,7 @@ class Sbg:
 
     def __init__(self) -> None:
         database = sbg_database()
-        self._info = database["SBG_ECAN_MSG_IMU_INFO"]
-        kinds = {self._info: OPENING}
+        kinds = {database["SBG_ECAN_MSG_IMU_INFO"]: OPENING}
         self._columns: dict[str, list[int]] = {}
         for name, (kind, signal) in VECTORS.items():
             codec = database[f"SBG_ECAN_MSG_{name}"]
@@ -73,16 +72,13 @@ class Sbg:
         kind, found = self._groups.sorted(batch)
         value = np.zeros((len(batch), 3))
         for codec, (rows, data) in found.items():
+            said = codec.decode(data, np.empty((len(rows), len(codec.signals))))
             if codec.name in self._columns:
-                said = codec.decode(data, np.empty((len(rows), len(codec.signals))))
                 value[rows] = said[:, self._columns[codec.name]]
-            elif codec is self._info and len(rows):
-                said = codec.decode(data, np.empty((len(rows), len(codec.signals))))
+            elif len(rows):
                 status = said[:, codec.columns["STATUS"]].astype(np.int64)
                 value[rows, 0] = said[:, codec.columns["TIME_STAMP"]]
                 value[rows, 1] = status & HEALTHY != HEALTHY
-                self._identity = {
-                    "status": int(status[-1]),
-                    "temperature": float(said[-1, codec.columns["TEMPERATURE"]]),
-                }
+                temperature = float(said[-1, codec.columns["TEMPERATURE"]])
+                self._identity = {"status": int(status[-1]), "temperature": temperature}
         return self._groups.take(kind, value, batch["time_ns"])

@@ -81,8 +81,9 @@ class SimulatedHead:
             batch = self._encoder.samples(counter, ends, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
         else:
             dtheta: FloatArray = sensed.dtheta @ self._axes.T
+            time = np.asarray(1e-6 * ends, np.float64)
             step = np.full(count, self.step)
-            batch = self._board.samples(ImuIncrements(1e-6 * ends, step, dtheta, sensed.dvel, sensed.status, counter))
+            batch = self._board.samples(ImuIncrements(time, step, dtheta, sensed.dvel, sensed.status, counter))
         rows, arrivals = self._aiding.arrived(int(ends[-1]))
         if len(rows) == 0:
             return batch
