@@ -65,21 +65,69 @@ class FrameDriver(Protocol):
         """What the board says of itself: serial, temperatures, built-in test."""
 
 
+class BoardEmulator(Protocol):
+    """The other end of a driver of `ImuIncrements`, found by the entry-point group `dtg_hil.emulators` under the driver's name.
+
+    It is made with the sample period in us.
+    """
+
+    frames_per_sample: int
+
+    def samples(self, imu: ImuIncrements) -> FrameArray:
+        """Frames of samples, in body axes, in the order in which the board sends them, stamped with simulated time (ns).
+
+        The calls follow one another.
+        """
+
+    def slow(self) -> FrameArray:
+        """What the board sends once a second."""
+
+
 def driver_names() -> list[str]:
     """Names of the drivers that are installed."""
-    return sorted(point.name for point in entry_points(group="dtg_hil.drivers"))
+    return _names("dtg_hil.drivers")
+
+
+def emulator_names() -> list[str]:
+    """Names of the drivers whose boards can be emulated, the DTG head aside."""
+    return _names("dtg_hil.emulators")
 
 
 def make_driver(name: str) -> FrameDriver:
-    """A new driver by name.
+    """A new driver by name; what follows ``@`` in it is handed to the driver.
 
     Raises
     ------
     HilError
-        No driver of that name; names what there is.
+        No driver of that name; names what there is. Or the driver refuses what follows ``@``.
     """
+    bare, at, option = name.partition("@")
     for point in entry_points(group="dtg_hil.drivers"):
-        if point.name == name:
-            driver: FrameDriver = point.load()()
+        if point.name == bare:
+            try:
+                driver: FrameDriver = point.load()(*([option] if at else []))
+            except TypeError as error:
+                if not at:
+                    raise
+                raise HilError(f"driver {bare!r} takes no option: leave @{option} out") from error
             return driver
-    raise HilError(f"no driver {name!r}; there is: {', '.join(driver_names())}")
+    raise HilError(f"no driver {bare!r}; there is: {', '.join(driver_names())}")
+
+
+def make_emulator(name: str, period_us: int) -> BoardEmulator:
+    """A new emulator of the board of the driver `name` with samples every `period_us`.
+
+    Raises
+    ------
+    HilError
+        The board cannot be emulated; names those that can. Or it has no such period.
+    """
+    for point in entry_points(group="dtg_hil.emulators"):
+        if point.name == name.partition("@")[0]:
+            emulator: BoardEmulator = point.load()(period_us)
+            return emulator
+    raise HilError(f"no emulator of {name!r}; there is: dtg-head, {', '.join(emulator_names())}")
+
+
+def _names(group: str) -> list[str]:
+    return sorted(point.name for point in entry_points(group=group))

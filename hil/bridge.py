@@ -37,7 +37,7 @@ from hil.settings import settings_of
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
-from hil.world.instruments import head_model
+from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
 from nav.aiding import Kind
 from nav.errors import HilError
@@ -73,6 +73,8 @@ class LoopOrder:
         An attitude to compare with (another estimator's, from a log).
     keep_trace : bool
         Give our attitudes back with the result (``trace``: times, attitudes).
+    own_world : bool
+        The samples are of the scenario's own world, also where the board cannot say so.
     """
 
     scenario: Scenario
@@ -80,6 +82,7 @@ class LoopOrder:
     paced: bool = True
     reference: Reference | None = None
     keep_trace: bool = False
+    own_world: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,13 +129,14 @@ class Loop:
         """Device time at which the first sample began."""
         self._withheld = 0
         self._combiner = HeadCombiner(head_model(scenario.head))
+        self._mounting = mounting(scenario.head) if any(scenario.head.mounting_deg) else None
         calibration = validated(scenario.head.calibration or NO_HEAD, "in the loop")
         self._calibrated = calibration.serial or None  # 0: of no particular head
         self._magnetometer = calibration.magnetometer
         self._outlets = outlets
         self._live = order.paced and order.file is None
         self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
-        self._truth: TruthKeeper | None = None
+        self._truth = self._own_truth if order.own_world else None
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
         self._reference = order.reference
@@ -217,7 +221,7 @@ class Loop:
             self._truth = self._own_truth
         if self._from_truth and not self._begin(raw):
             return
-        imu = self._combine(raw) if isinstance(raw, HeadIncrements) else raw
+        imu = self._combine(raw) if isinstance(raw, HeadIncrements) else self._turned(raw)
         rows = self.navigator.process(imu)
         rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
         self._arrival_ns = int(arrivals[-1])
@@ -240,6 +244,12 @@ class Loop:
                 self.navigator.tell(float(raw.time[0]), "warning", text)
             self._calibrated = None
         return imu
+
+    def _turned(self, raw: ImuIncrements) -> ImuIncrements:
+        """A board's increments in body axes."""
+        if self._mounting is None:
+            return raw
+        return replace(raw, dtheta=raw.dtheta @ self._mounting.T, dvel=raw.dvel @ self._mounting.T)
 
     def _cut(self, raw: HeadIncrements | ImuIncrements) -> HeadIncrements | ImuIncrements:
         """Up to the scenario's duration: the device time covered so far, all lives of the device together."""

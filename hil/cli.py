@@ -80,6 +80,7 @@ def run(
     order = LoopOrder(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
+        own_world=not outside,
     )
     _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from drivers import emulator_names
 from hil.ring import Ring
 from hil.scenario import Scenario
 from nav.aiding import Kind, aiding_rows
@@ -24,9 +25,13 @@ Report = Callable[[int], None]
 def _miniature(scenario: Scenario) -> Scenario:
     """A second and a half with the sensors of `scenario`, in the way of aligning that any of them can go."""
     head = {**scenario.head.model_dump(), "rate_hz": 200.0}
+    driver = scenario.driver if scenario.driver.partition("@")[0] in emulator_names() else "dtg-head"
+    if driver != "dtg-head":
+        head |= {"instruments": "ideal", "faults": ()}
     return Scenario.model_validate(
         {
             "bus": "unix:none",
+            "driver": driver,
             "duration_s": 1.5,
             "head": head,
             "aiding": scenario.aiding.model_dump(),

@@ -160,11 +160,12 @@ class UnixPort:
         return filled
 
     def send(self, batch: FrameArray) -> None:
-        """Send `batch` to every listener, stamped with the host's clock."""
+        """Send `batch` to every listener, stamped with the host's clock; when lossless, a stamp that a frame has is kept."""
         self._accept()
         for start in range(0, len(batch), PACKET):
             packet = batch[start : start + PACKET]
-            packet["time_ns"] = time.time_ns()
+            stamps = packet["time_ns"]
+            stamps[(stamps == 0) | (not self._lossless)] = time.time_ns()
             data = packet.tobytes()
             for fd, peer in list(self._peers.items()):
                 if fd not in self._deaf:

@@ -1,7 +1,8 @@
 """The simulated sensor head: the scenario's motion through its instruments onto the bus, in a process of its own. What else the
 simulated world measures goes out between the samples.
 
-The frames depend on the scenario alone: the same scenario gives the same bytes at any speed.
+The frames depend on the scenario alone: the same scenario gives the same bytes at any speed. With a `driver` other than that of
+the DTG head they are those of the board of that driver: the same increments, as that board rounds them.
 """
 
 import math
@@ -12,6 +13,7 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
+from drivers import BoardEmulator, make_emulator
 from drivers.can.aiding import AidingEncoder, is_aiding, merge
 from drivers.can.bus import Port, open_port
 from drivers.can.dtg_head_emulator import SIMULATED, HeadEncoder
@@ -24,6 +26,8 @@ from hil.warmup import warm_head
 from hil.world.aiding import SimulatedAiding
 from hil.world.instruments import instruments
 from nav.errors import HilError
+from nav.increments import FloatArray, ImuIncrements
+from nav.instruments.redundancy import layout
 
 CHUNK_S = 0.1
 """Motion is computed this far ahead."""
@@ -36,8 +40,12 @@ class SimulatedHead:
         head = scenario.head
         self.period_us = round(1e6 / head.rate_hz)
         self.step = self.period_us * 1e-6
-        self.frames_per_sample = 1 if head.layout == "fd" else 6
         self._instruments = instruments(scenario, self.step)
+        self._board = None if scenario.driver == "dtg-head" else board_of(scenario, self.period_us)
+        self._axes = np.linalg.pinv(layout(math.radians(head.skew_deg)))
+        self.frames_per_sample = (
+            (1 if head.layout == "fd" else 6) if self._board is None else self._board.frames_per_sample
+        )
         self._encoder = HeadEncoder(
             head.layout,
             self.period_us,
@@ -59,7 +67,9 @@ class SimulatedHead:
         while samples is None or first < samples:
             until_slow = self._slow_every - first % self._slow_every
             count = min(self._chunk, until_slow, (samples or first + self._chunk) - first)
-            slow = self._encoder.slow() if first % self._slow_every == 0 else frames(0)
+            slow = (self._board or self._encoder).slow() if first % self._slow_every == 0 else frames(0)
+            if self._board is not None:
+                slow["time_ns"] = 1 + first * self.period_us * 1000
             yield first, slow, self._samples(first, count)
             first += count
 
@@ -67,12 +77,36 @@ class SimulatedHead:
         sensed = self._instruments.sense(first, count)
         counter = np.arange(first, first + count)
         ends = (counter + 1) * self.period_us
-        batch = self._encoder.samples(counter, ends, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
+        if self._board is None:
+            batch = self._encoder.samples(counter, ends, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
+        else:
+            dtheta: FloatArray = sensed.dtheta @ self._axes.T
+            time = np.asarray(1e-6 * ends, np.float64)
+            step = np.full(count, self.step)
+            batch = self._board.samples(ImuIncrements(time, step, dtheta, sensed.dvel, sensed.status, counter))
         rows, arrivals = self._aiding.arrived(int(ends[-1]))
         if len(rows) == 0:
             return batch
         frames_of_rows = self._aiding_encoder.frames(rows)
-        return merge(batch, frames_of_rows, np.searchsorted(ends, arrivals), self.frames_per_sample)
+        merged = merge(batch, frames_of_rows, np.searchsorted(ends, arrivals), self.frames_per_sample)
+        if self._board is not None:
+            np.maximum.accumulate(merged["time_ns"], out=merged["time_ns"])
+        return merged
+
+
+def board_of(scenario: Scenario, period_us: int) -> BoardEmulator:
+    """The emulated board in the place of the head.
+
+    Raises
+    ------
+    HilError
+        The board cannot be emulated, has no such period, or the instruments are those of the DTG head.
+    """
+    if scenario.head.instruments != "ideal" or scenario.head.faults:
+        raise HilError(
+            f"an emulated {scenario.driver} has ideal instruments: leave head.instruments and head.faults out"
+        )
+    return make_emulator(scenario.driver, period_us)
 
 
 def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool, cancelled: Callable[[], bool]) -> int:
