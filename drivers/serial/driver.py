@@ -122,7 +122,7 @@ class SerialDriver:
         return result
 
     def _add(self, reading: Reading, arrival: int) -> None:
-        if not all(abs(value) < _LARGEST for value in (*reading.turn, *reading.push)):  # NaN is not less either
+        if not math.hypot(*reading.turn, *reading.push) < _LARGEST:  # nor is NaN
             self.counters.crc_errors += 1
             return
         step_ns = self._timeline.place(reading.time_ns, reading.counter, reading.step_ns)

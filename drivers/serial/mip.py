@@ -31,6 +31,8 @@ _OVERRANGED = 0x0077
 """Bits of the overrange status: axes of the accelerometer and of the gyro."""
 OUTPUTS = (REFERENCE_TIME, DELTA_THETA, DELTA_VELOCITY)
 """What `configure` asks for."""
+SIZE = 44
+"""Bytes of that packet."""
 
 
 def packet_of(descriptor_set: int, fields: list[tuple[int, bytes]]) -> bytes:
@@ -109,7 +111,7 @@ class Mip:
 
     def configure(self, dialog: Dialog, rate_hz: float, baud: int) -> dict[str, object]:
         """See `Board.configure`: reference time, delta theta and delta velocity; the format is read back."""
-        check_line(rate_hz, 6 + 10 + 14 + 14, baud)
+        check_line(rate_hz, SIZE, baud)
         _ask(dialog, "set to idle", BASE, IDLE)
         answer = _ask(dialog, "get base rate", DM3, BASE_RATE, bytes([SENSOR])).get(0x8E, b"")
         base = struct.unpack(">H", answer[1:])[0] if len(answer) == 3 else 0

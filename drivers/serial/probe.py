@@ -50,8 +50,11 @@ def listen(url: str, names: list[str], seconds: float) -> Heard:
     HilError
         The port cannot be opened.
     """
-    drivers = ((name, make_driver(name)) for name in names)
-    streams = {name: driver.stream for name, driver in drivers if isinstance(driver, SerialDriver)}
+    streams = {}
+    for name in names:
+        driver = make_driver(name)
+        if isinstance(driver, SerialDriver):
+            streams[name] = driver.stream
     batch, count = frames(256), 0
     with contextlib.closing(SerialPort(url)) as port:
         deadline = time.monotonic() + seconds

@@ -45,6 +45,8 @@ _LINE = re.compile(rb"\$VN[ -)+-~]{1,250}\*(?:[0-9A-Fa-f]{2}){1,2}\r\n")
 _PART = re.compile(rb"\$(V(N[ -~]{0,256}\r?)?)?\Z")
 GROUPS, MASKS = 0x05, (0x0801, 0x0810)
 """What `configure` asks for: time since start-up, DeltaThetaVel; temperature, saturation."""
+SIZE = 50
+"""Bytes of that packet."""
 BOTH_PORTS = 3
 
 
@@ -175,7 +177,7 @@ class VectorNav:
 
     def configure(self, dialog: Dialog, rate_hz: float, baud: int) -> dict[str, object]:
         """See `Board.configure`: registers 06 (no ASCII output), 82 (body axes, nothing taken off) and 75, which is read back."""
-        check_line(rate_hz, 10 + 8 + 28 + 6, baud)
+        check_line(rate_hz, SIZE, baud)
         _ask(dialog, "VNASY,0")
         model = _ask(dialog, "VNRRG,01").split(",")[-1]
         base = 400 if model.startswith("VN-3") else 800

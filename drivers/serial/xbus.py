@@ -12,7 +12,8 @@ Increments (DeltaQ, DeltaV) are taken where they are sent, else rate of turn and
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 from drivers.serial.dialog import Dialog, check_line
 from drivers.serial.driver import Reading, SerialDriver, Three, rotation_vector
@@ -29,17 +30,18 @@ TICK_NS = 100_000
 """Of SampleTimeFine."""
 TEMPERATURE, COUNTER, TIME_FINE, STATUS = 0x0810, 0x1020, 0x1060, 0xE020
 DELTA_Q, DELTA_V, RATE, ACCELERATION = 0x8030, 0x4010, 0x8020, 0x4020
+SIZE = 65
+"""Bytes of the longest message that `configure` asks for."""
 _SELF_TEST, _CLIPPED = 0x01, 0x3F00
 """Bits of the status word: the self-test was passed; an accelerometer or gyro is clipped."""
 AXES = {0x0: "ENU", 0x4: "NED", 0x8: "NWU"}
-_ORIENTED = {0x2010, 0x2020, 0x2030, 0x4030}
-_REALS = {TEMPERATURE, *_ORIENTED, DELTA_V, ACCELERATION, 0x4040, RATE, DELTA_Q, 0x8040, 0xC020}
+_ORIENTED = {0x2010, 0x2020, 0x2030}
+_REALS = {TEMPERATURE, *_ORIENTED, DELTA_V, ACCELERATION, 0x4030, 0x4040, RATE, DELTA_Q, 0x8040, 0xC020}
 _WHOLE = {COUNTER: ">H", TIME_FINE: ">I", 0x1070: ">I", 0x3010: ">I", 0xE010: ">B", STATUS: ">I"}
 _SIZES = (4, 4, 6, 8)
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(NamedTuple):
     """One field of MTData2: `values` in units of the protocol, `axes` of an orientation (else empty)."""
 
     values: tuple[float, ...]
@@ -58,15 +60,30 @@ def payload(packet: bytes) -> bytes:
     return packet[6:-1] if packet[3] == 0xFF else packet[4:-1]
 
 
-def _numbers(data: bytes, form: int) -> tuple[float, ...]:
-    """Values in one of the four number formats."""
-    if form == 1:
-        return tuple(value * 2.0**-20 for value in struct.unpack(f">{len(data) // 4}i", data))
-    if form == 2:  # the fraction stands before the whole part
-        parts = struct.unpack(">" + "Ih" * (len(data) // 6), data)
-        return tuple(w + f * 2.0**-32 for f, w in zip(parts[::2], parts[1::2], strict=True))
-    code, size = ("f", 4) if form == 0 else ("d", 8)
-    return struct.unpack(f">{len(data) // size}{code}", data)
+@lru_cache(256)
+def _form(identifier: int, length: int) -> tuple[int, str, struct.Struct, int] | None:
+    """Name, axes, layout and number format of a field; None for a name that is not known.
+
+    Raises
+    ------
+    ValueError
+        The length does not fit the format.
+    """
+    name, form = identifier & 0xFFF0, identifier & 0x3
+    if name in _WHOLE:
+        layout, form, size = _WHOLE[name], 0, length
+        if struct.calcsize(layout) != length:
+            raise ValueError
+    elif name in _REALS:
+        size = _SIZES[form]
+        layout = ">" + ("f", "i", "Ih", "d")[form] * (
+            length // size
+        )  # 16.32: the fraction stands before the whole part
+    else:
+        return None
+    if length == 0 or length % size:
+        raise ValueError
+    return name, AXES.get(identifier & 0xC, "") if name in _ORIENTED else "", struct.Struct(layout), form
 
 
 def read_fields(data: bytes) -> dict[int, Field] | None:
@@ -76,22 +93,22 @@ def read_fields(data: bytes) -> dict[int, Field] | None:
     """
     fields: dict[int, Field] = {}
     at = 0
-    while at < len(data):
-        if at + 3 > len(data) or at + 3 + data[at + 2] > len(data):
-            return None
-        identifier, length = data[at] << 8 | data[at + 1], data[at + 2]
-        part = data[at + 3 : at + 3 + length]
-        at += 3 + length
-        name, form = identifier & 0xFFF0, identifier & 0x3
-        if name in _REALS:
-            if length == 0 or length % _SIZES[form]:
-                return None
-            fields[name] = Field(_numbers(part, form), AXES.get(identifier & 0xC, "") if name in _ORIENTED else "")
-        elif name in _WHOLE:
-            if length != struct.calcsize(_WHOLE[name]):
-                return None
-            fields[name] = Field(struct.unpack(_WHOLE[name], part))
-    return fields
+    try:
+        while at < len(data):
+            length = data[at + 2]
+            known = _form(data[at] << 8 | data[at + 1], length)
+            at += 3 + length
+            if known is not None:
+                name, axes, layout, form = known
+                values = layout.unpack_from(data, at - length)
+                if form == 1:
+                    values = tuple(value * 2.0**-20 for value in values)
+                elif form == 2:
+                    values = tuple(w + f * 2.0**-32 for f, w in zip(values[::2], values[1::2], strict=True))
+                fields[name] = Field(values, axes)
+    except (IndexError, ValueError, struct.error):
+        return None
+    return fields if at == len(data) else None
 
 
 def _body(values: tuple[float, ...]) -> Three:
@@ -162,7 +179,7 @@ class Xbus:
         """See `Board.configure`: counter, time, DeltaQ, DeltaV and status at `rate_hz`, temperature once a second."""
         if not (rate_hz == int(rate_hz) and 1 <= rate_hz <= 0xFFFE):
             raise HilError(f"xsens-xbus: {rate_hz:g} Hz is not a whole number of hertz")
-        check_line(rate_hz, 64, baud)
+        check_line(rate_hz, SIZE, baud)
         _ask(dialog, "GotoConfig", GOTO_CONFIG)
         device = payload(_ask(dialog, "ReqDID", REQUEST_ID))
         wanted = [(COUNTER, 0xFFFF), (TIME_FINE, 0xFFFF), (STATUS, 0xFFFF), (TEMPERATURE, 1)]

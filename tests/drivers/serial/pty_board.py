@@ -95,6 +95,7 @@ class Plugged:
         self.heard = b""
         self._speed = None if only_baud is None else getattr(termios, f"B{only_baud}")
         self._master, self._slave = os.openpty()
+        os.set_blocking(self._master, False)
         path.unlink(missing_ok=True)
         path.symlink_to(os.ttyname(self._slave))
         self._ended = threading.Event()
@@ -113,10 +114,10 @@ class Plugged:
                     self.send(self.emulator.answer(data))
 
     def send(self, data: bytes) -> None:
-        """Put bytes on the line."""
+        """Put bytes on the line; what nobody reads for a second is lost."""
         if self._speed is not None and termios.tcgetattr(self._slave)[5] != self._speed:
             data = bytes((byte * 7 + 3) & 0xFF for byte in data)
-        while data:
+        while data and select.select([], [self._master], [], 1.0)[1]:
             data = data[os.write(self._master, data) :]
 
     def unplug(self) -> None:

@@ -1,5 +1,6 @@
 """What every board on a serial port must do: same samples out as in, every loss counted, damage and rubbish survived."""
 
+import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -301,6 +302,11 @@ def test_configured_on_a_real_port(name: str, tmp_path: Path) -> None:
             set_up(name, url, 100.5 if name == "xsens-xbus" else 333.0)
         with pytest.raises(HilError, match="baud"):
             set_up(name, url.replace("921600", "9600"), 100.0)
+
+
+def test_the_line_is_judged_by_the_packet_that_is_sent(name: str) -> None:
+    driver, emulator = made(name)
+    assert {len(packet) for packet in emulator.packets(moving(3))} == {sys.modules[type(driver.board).__module__].SIZE}
 
 
 def test_a_board_that_does_not_answer(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -129,7 +129,7 @@ def test_a_port_in_use_and_a_file_that_is_none(port_file: Path, tmp_path: Path) 
     with (
         Plugged(None, port_file),
         closing(opened(port_file)),
-        pytest.raises(HilError, match="another program has it.*fuser"),
+        pytest.raises(HilError, match=r"another program has it.*fuser"),
     ):
         opened(port_file)
     file = tmp_path / "file"
@@ -147,14 +147,16 @@ def test_no_permission_names_the_group(port_file: Path) -> None:
 
 
 def test_a_port_server_on_the_network() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        with closing(open_port(f"serial:socket://127.0.0.1:{server.getsockname()[1]}")) as port:
-            assert isinstance(port, SerialPort)
-            client, _ = server.accept()
-            with client:
-                client.sendall(b"from afar")
-                assert received(port, 9) == b"from afar"
-                port.send(to_chunks(b"back"))
-                assert client.recv(10) == b"back"
-            assert received(port, 1, 0.3) == b""
-            assert port.failures == 1
+    with (
+        socket.create_server(("127.0.0.1", 0)) as server,
+        closing(open_port(f"serial:socket://127.0.0.1:{server.getsockname()[1]}")) as port,
+    ):
+        assert isinstance(port, SerialPort)
+        client, _ = server.accept()
+        with client:
+            client.sendall(b"from afar")
+            assert received(port, 9) == b"from afar"
+            port.send(to_chunks(b"back"))
+            assert client.recv(10) == b"back"
+        assert received(port, 1, 0.3) == b""
+        assert port.failures == 1

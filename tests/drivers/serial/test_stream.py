@@ -1,4 +1,4 @@
-"""Bytes to packets: nothing depends on how they were cut, every byte is accounted for, and rubbish costs bounded time and memory."""
+"""Bytes to packets: nothing depends on how they were cut, every byte is accounted for, rubbish costs bounded time and memory."""
 
 import re
 

@@ -108,6 +108,16 @@ def test_number_formats_keep_what_they_can(form: str, resolution: float) -> None
     np.testing.assert_allclose(got.dvel[1:], sent.dvel[2:], atol=2.0 * resolution + 3e-8)
 
 
+@pytest.mark.parametrize(("form", "error"), [("float32", 1e-6), ("double", 1e-6), ("fp16.32", 1e-3), ("fp12.20", None)])
+def test_what_the_formats_leave_of_the_earths_rate(form: str, error: float | None) -> None:
+    """At 100 Hz the half-angle of a step is 0.36e-6, and the last place of 12.20 is 0.95e-6: a resting board sends zeros."""
+    earth, sent = 7.292115e-5, moving(50)
+    sent.dtheta[:] = [earth * STEP_S, 0.0, 0.0]
+    got = decoded(xsens_xbus(), to_chunks(b"".join(XbusEmulator(form).packets(sent))))
+    rate = got.dtheta[:, 0].mean() / STEP_S
+    assert rate == 0.0 if error is None else abs(rate / earth - 1.0) < error
+
+
 def test_counter_and_clock_turn_over() -> None:
     sent = moving(300, start_s=2**32 * 1e-4 - 1.0)
     driver = xsens_xbus()
