@@ -65,15 +65,29 @@ def to_integrals(phi: FloatArray, u: FloatArray, coned: IntArray, sequence: IntA
         past[0], past[1:4], past[4:7], past[7] = sequence[n], angle, velocity, 1.0
 
 
-def from_integrals(dtheta: FloatArray, dvel: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What a board with coning and sculling inside delivers for integrals of rate and force: phi and u, (n, 3) each."""
-    phi, u = dtheta.copy(), np.empty_like(dvel)
-    phi[1:] += np.cross(dtheta[:-1], dtheta[1:]) / 12.0
+def from_integrals(dtheta: FloatArray, dvel: FloatArray, before: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What a board with coning and sculling inside delivers for integrals of rate and force, for the emulators.
+
+    Parameters
+    ----------
+    dtheta, dvel : (n, 3) float
+        Integrals of rate, rad, and force, m/s.
+    before : (2, 3) float
+        Both of the step before the first; renewed. Zeros at first.
+
+    Returns
+    -------
+    phi, u : (n, 3) float
+        Rotation vectors, rad, and velocity changes, m/s.
+    """
+    angles, velocities = np.concatenate([before[:1], dtheta]), np.concatenate([before[1:], dvel])
+    phi, u = dtheta + np.cross(angles[:-1], angles[1:]) / 12.0, np.empty_like(dvel)
     for n, (angle, velocity) in enumerate(zip(phi, dvel, strict=True)):
         size = math.sqrt(angle @ angle)
         single = 0.5 if size < 1e-4 else (1.0 - math.cos(size)) / size**2
         double = 1.0 / 6.0 if size < 1e-4 else (size - math.sin(size)) / size**3
         turned = np.cross(angle, velocity)
         u[n] = velocity + single * turned + double * np.cross(angle, turned)
-    u[1:] += (np.cross(dtheta[:-1], dvel[1:]) + np.cross(dvel[:-1], dtheta[1:])) / 12.0
+    u += (np.cross(angles[:-1], velocities[1:]) + np.cross(velocities[:-1], angles[1:])) / 12.0
+    before[0], before[1] = angles[-1], velocities[-1]
     return phi, u

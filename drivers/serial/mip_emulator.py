@@ -2,6 +2,8 @@
 
 import struct
 
+import numpy as np
+
 from drivers.serial import mip
 from drivers.serial.chunks import to_chunks
 from drivers.serial.increments import from_integrals
@@ -24,6 +26,7 @@ class MipEmulator:
 
     def __init__(self, *, increments: bool = True) -> None:
         self._increments = increments
+        self._before = np.zeros((2, 3))
         self._stream = ByteStream(mip.Mip())
         self.format = b""
         """Message format as it was set."""
@@ -31,7 +34,7 @@ class MipEmulator:
 
     def packets(self, imu: ImuIncrements, overrange: int = 0) -> list[bytes]:
         """One packet for each sample."""
-        phi, u = from_integrals(imu.dtheta, imu.dvel)
+        phi, u = from_integrals(imu.dtheta, imu.dvel, self._before)
         out = []
         for k in range(len(imu)):
             time = round(imu.time[k] * 1e9)

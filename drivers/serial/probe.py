@@ -8,6 +8,7 @@ from drivers import driver_names, make_driver
 from drivers.can.frames import frames
 from drivers.serial.driver import SerialDriver
 from drivers.serial.port import SerialPort
+from drivers.serial.stream import ByteStream
 from nav.errors import HilError
 
 RATES = (115200, 921600, 460800, 230400, 1000000, 2000000, 57600, 38400, 19200, 9600)
@@ -50,7 +51,7 @@ def listen(url: str, names: list[str], seconds: float) -> Heard:
     HilError
         The port cannot be opened.
     """
-    streams = {}
+    streams: dict[str, ByteStream] = {}
     for name in names:
         driver = make_driver(name)
         if isinstance(driver, SerialDriver):

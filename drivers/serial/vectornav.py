@@ -151,8 +151,8 @@ class VectorNav:
             return "foreign"
         if where.turn < 0 or where.time < 0:
             return "short"
-        if where.temperature >= 0:
-            self._said["temperature_c"] = struct.unpack_from("<f", packet, where.temperature)[0]
+        if where.temperature >= 0 and math.isfinite(warm := struct.unpack_from("<f", packet, where.temperature)[0]):
+            self._said["temperature_c"] = warm
         saturated = struct.unpack_from("<H", packet, where.saturation)[0] & _SATURATED if where.saturation >= 0 else 0
         turn = _three(packet, where.turn)
         step_ns = 0

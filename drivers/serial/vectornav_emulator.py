@@ -28,13 +28,14 @@ class VectorNavEmulator:
 
     def __init__(self, model: str = "VN-100T-CR", *, increments: bool = True) -> None:
         self._increments = increments
+        self._before = np.zeros((2, 3))
         self._stream = ByteStream(vectornav.VectorNav())
         self.registers = {"01": model, "06": "14", "75": "0,8,01,0029", "82": "0,0,0,0,0"}
         self.measuring = True
 
     def packets(self, imu: ImuIncrements, saturation: int = 0, temperature_c: float = 25.0) -> list[bytes]:
         """One binary packet for each sample."""
-        phi, u = from_integrals(imu.dtheta, imu.dvel)
+        phi, u = from_integrals(imu.dtheta, imu.dvel, self._before)
         out = []
         for k in range(len(imu)):
             time = struct.pack("<Q", round(imu.time[k] * 1e9))

@@ -9,6 +9,7 @@ Low-Level Communication Protocol.
 Increments (DeltaQ, DeltaV) are taken where they are sent, else rate of turn and acceleration.
 """
 
+import math
 import re
 import struct
 from collections.abc import Callable
@@ -149,7 +150,7 @@ class Xbus:
         fields = read_fields(payload(packet))
         if fields is None:
             return "short"
-        if TEMPERATURE in fields:
+        if TEMPERATURE in fields and math.isfinite(fields[TEMPERATURE].values[0]):
             self._said["temperature_c"] = fields[TEMPERATURE].values[0]
         status = int(fields[STATUS].values[0]) if STATUS in fields else _SELF_TEST
         self._said["status"] = status

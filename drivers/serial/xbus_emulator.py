@@ -50,6 +50,7 @@ class XbusEmulator:
         self._increments = increments
         self._counter = first
         self._device = device
+        self._before = np.zeros((2, 3))
         self._stream = ByteStream(xbus.Xbus())
         self.measuring = True
         self.outputs: dict[int, int] = {}
@@ -57,7 +58,7 @@ class XbusEmulator:
 
     def packets(self, imu: ImuIncrements, status: int = 0x03, temperature_c: float = 25.0) -> list[bytes]:
         """One MTData2 message for each sample; the increments are those of a board that does its own coning."""
-        phi, u = from_integrals(imu.dtheta, imu.dvel)
+        phi, u = from_integrals(imu.dtheta, imu.dvel, self._before)
         half = np.linalg.norm(phi, axis=1, keepdims=True) / 2.0
         sine = np.sinc(half / np.pi) / 2.0
         delta_q = np.concatenate([np.cos(half), sine * phi * [1, -1, -1]], axis=1)

@@ -14,6 +14,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
+from serial.tools.list_ports_common import ListPortInfo
 
 sys.path.append(str(Path(__file__).parents[1] / "drivers" / "serial"))
 from pty_board import BOARDS, Plugged
@@ -190,6 +191,17 @@ def test_the_command_runs_records_and_replays_a_board(port_file: Path, tmp_path:
     assert summary["mode"] == "navigate"
     again, _ = hil("replay", path, "--speed", "max")
     assert again["navigation_digest"] == summary["navigation_digest"]
+
+
+def test_the_doctor_finds_a_board(port_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = ListPortInfo(str(port_file), skip_link_detection=True)
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [there])
+    emulator = BOARDS["microstrain-mip"][1]()
+    with Plugged(emulator, port_file) as board, Feeder(board, emulator, standing_then_turning()):
+        said, _ = hil("doctor", "--probe")
+    found = [finding for finding in said["findings"] if finding["what"] == str(port_file)]
+    assert [finding["verdict"] for finding in found] == ["ok"]
+    assert found[0]["found"] == f"hil run --imu microstrain-mip --bus serial:{port_file}:115200"
 
 
 def test_the_command_sets_a_board_up(port_file: Path) -> None:
