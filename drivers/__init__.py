@@ -47,7 +47,7 @@ class Counters:
 
 
 class FrameDriver(Protocol):
-    """A board on CAN."""
+    """A board on a bus or a port."""
 
     counters: Counters
     period_s: float | None

@@ -29,7 +29,7 @@ class RunFailed(HilError):
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else.")]
-Bus = Annotated[str | None, typer.Option(help="Bus URL: unix:NAME, socketcan:vcan0, udp_multicast:239.74.163.2, ...")]
+Bus = Annotated[str | None, typer.Option(help="Bus URL: unix:NAME, socketcan:vcan0, serial:/dev/ttyUSB0:921600, ...")]
 Duration = Annotated[float | None, typer.Option(min=0.0, help="Seconds of device time, then stop.")]
 Speed = Annotated[str, typer.Option(help="1: real time; max: simulated time, as fast as it goes.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of the simulated errors.")]
@@ -77,6 +77,11 @@ def run(
         raise HilError(
             "--speed max needs the simulated head of `hil run`: leave --bus, --imu and the scenario's bus out"
         )
+    if chosen.bus.startswith("serial:"):
+        from drivers.serial.probe import check_port
+
+        if warning := check_port(chosen.bus, chosen.driver):
+            _say(warning)
     order = LoopOrder(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
@@ -316,11 +321,27 @@ def _calibrate(
 
 
 @app.command()
-def doctor(as_json: Json = False) -> None:
+def configure(
+    driver: Annotated[str, typer.Argument(help="Driver of the board: xsens-xbus, vectornav, microstrain-mip.")],
+    bus: Annotated[str, typer.Option(help="serial:/dev/ttyUSB0:921600")],
+    rate: Annotated[float, typer.Option(min=0.0, help="Samples a second, Hz.")],
+    as_json: Json = False,
+) -> None:
+    """Make a board on a serial port send what its driver wants; the board forgets it when it is switched off."""
+    from drivers.serial.setup import set_up
+
+    _report(set_up(driver, bus, rate), as_json=as_json)
+
+
+@app.command()
+def doctor(
+    probe: Annotated[bool, typer.Option("--probe", help="Listen on every serial port for known boards.")] = False,
+    as_json: Json = False,
+) -> None:
     """Say what this machine can do, and the command that mends each lack."""
     from hil.doctor import examine
 
-    findings = examine()
+    findings = examine(probe=probe)
     if as_json:
         print(json.dumps({"findings": [finding.as_dict() for finding in findings]}))
         return

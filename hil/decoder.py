@@ -14,6 +14,7 @@ from drivers.can.bus import open_port
 from drivers.can.convert import to_message
 from drivers.can.frames import frames
 from drivers.logs.recording import EVENT, RecordingWriter
+from drivers.serial.chunks import is_chunk
 from hil.scenario import Scenario
 from hil.source import FileSource
 from nav.errors import HilError
@@ -54,16 +55,18 @@ def record_bus(
     """Record frames of the scenario's bus until cancelled; what was recorded."""
     port = open_port(scenario.bus)
     batch = frames(1024)
-    count, began = 0, time.monotonic()
+    count, chunks, began = 0, 0, time.monotonic()
     try:
         with _writer(path, scenario) as write:
             while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
                 n = port.receive(batch, 0.05)
                 write(batch[:n])
                 count += n
+                chunks += int(is_chunk(batch[:n]).sum())
     finally:
         port.close()
-    return {"file": str(path), "frames": count, "seconds": time.monotonic() - began}
+    left_out = {"not_exported": chunks} if path.suffix != ".dhil" and chunks else {}
+    return {"file": str(path), "frames": count, **left_out, "seconds": time.monotonic() - began}
 
 
 class _writer:
@@ -84,7 +87,7 @@ class _writer:
         return self._own.write if self._own is not None else self._write_foreign
 
     def _write_foreign(self, batch: Any) -> None:
-        for row in batch:
+        for row in batch[~is_chunk(batch)]:  # serial bytes are no CAN frames
             self._foreign.on_message_received(to_message(row, "can0"))
 
     def __exit__(self, *_: object) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from drivers import driver_names
+from nav.errors import HilError
 
 ARPHRD_CAN = "280"
 WANTED_RMEM = 4 << 20
@@ -33,9 +34,9 @@ class Finding:
         return asdict(self)
 
 
-def examine() -> list[Finding]:
-    """All findings."""
-    return [*_python(), *_can(), *_real_time(), *_network(), *_serial(), *_extras()]
+def examine(*, probe: bool = False) -> list[Finding]:
+    """All findings; `probe`: also who speaks on the serial ports, which takes seconds and opens them."""
+    return [*_python(), *_can(), *_real_time(), *_network(), *_serial(probe=probe), *_extras()]
 
 
 def _python() -> Iterator[Finding]:
@@ -128,7 +129,7 @@ def _network() -> Iterator[Finding]:
         yield Finding(f"UDP port {port}", "info", found)
 
 
-def _serial() -> Iterator[Finding]:
+def _serial(*, probe: bool) -> Iterator[Finding]:
     from serial.tools import list_ports
 
     ports = sorted(list_ports.comports(), key=lambda port: port.device)
@@ -136,6 +137,20 @@ def _serial() -> Iterator[Finding]:
     for port in ports:
         if not os.access(port.device, os.R_OK | os.W_OK):
             yield Finding(port.device, "lack", "no permission", "sudo usermod -aG dialout $USER, then log in again")
+        elif probe:
+            yield _board(port.device)
+
+
+def _board(device: str) -> Finding:
+    from drivers.serial.probe import probe
+
+    try:
+        heard = probe(device)
+    except HilError as error:
+        return Finding(device, "lack", str(error))
+    if heard is None:
+        return Finding(device, "info", "no board that is known, at any usual rate")
+    return Finding(device, "ok", f"hil run --imu {heard.driver} --bus serial:{device}:{heard.baud}")
 
 
 def _extras() -> Iterator[Finding]:

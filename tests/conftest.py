@@ -8,7 +8,7 @@ import hypothesis
 import pytest
 
 _TESTS = Path(__file__).parent
-_ALONE = {_TESTS / "e2e", _TESTS / "hil", _TESTS / "drivers" / "can", _TESTS / "drivers" / "mavlink"}
+_ALONE = {_TESTS / "e2e", _TESTS / "hil", *(_TESTS / "drivers" / wire for wire in ("can", "serial", "mavlink"))}
 
 hypothesis.settings.register_profile("local", deadline=None)
 hypothesis.settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)

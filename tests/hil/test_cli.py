@@ -20,7 +20,19 @@ from hil import cli
 
 Cli = Callable[..., tuple[int, str, str]]
 HIL = (sys.executable, "-c", "from hil.cli import main; main()")
-COMMANDS = ("run", "imu", "replay", "navigate", "decode", "record", "calibrate", "doctor", "bench", "version")
+COMMANDS = (
+    "run",
+    "imu",
+    "replay",
+    "navigate",
+    "decode",
+    "record",
+    "calibrate",
+    "configure",
+    "doctor",
+    "bench",
+    "version",
+)
 
 
 @pytest.fixture

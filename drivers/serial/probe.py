@@ -1,0 +1,109 @@
+"""Which board speaks on a port, and at which baud rate: listens for good packets of every serial driver that is installed."""
+
+import contextlib
+import time
+from dataclasses import dataclass
+
+from drivers import driver_names, make_driver
+from drivers.can.frames import frames
+from drivers.serial.driver import SerialDriver
+from drivers.serial.port import SerialPort
+from drivers.serial.stream import ByteStream
+from nav.errors import HilError
+
+RATES = (115200, 921600, 460800, 230400, 1000000, 2000000, 57600, 38400, 19200, 9600)
+"""Usual baud rates, the likely ones first."""
+LISTEN_S = 0.3
+"""How long each rate is listened to."""
+ENOUGH = 3
+"""Good packets that settle it: one may be chance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What was heard at one rate.
+
+    Attributes
+    ----------
+    driver : str
+        Whose packets; empty when nobody's.
+    baud : int
+        The rate.
+    bytes : int
+        Bytes that came.
+    """
+
+    driver: str
+    baud: int
+    bytes: int
+
+
+def serial_drivers() -> list[str]:
+    """Names of the installed drivers of serial boards."""
+    return [name for name in driver_names() if isinstance(make_driver(name), SerialDriver)]
+
+
+def listen(url: str, names: list[str], seconds: float) -> Heard:
+    """Who of `names` is on the port at `url`, within `seconds`.
+
+    Raises
+    ------
+    HilError
+        The port cannot be opened.
+    """
+    streams: dict[str, ByteStream] = {}
+    for name in names:
+        driver = make_driver(name)
+        if isinstance(driver, SerialDriver):
+            streams[name] = driver.stream
+    batch, count = frames(256), 0
+    with contextlib.closing(SerialPort(url)) as port:
+        deadline = time.monotonic() + seconds
+        while (left := deadline - time.monotonic()) > 0.0 and not port.failures:
+            n = port.receive(batch, left)
+            count += int(batch["length"][:n].sum())
+            for name, stream in streams.items():
+                for _ in stream.take(batch[:n]):
+                    pass
+                if stream.packets >= ENOUGH:
+                    return Heard(name, port.baud, count)
+    return Heard("", port.baud, count)
+
+
+def probe(place: str, names: list[str] | None = None, listen_s: float = LISTEN_S) -> Heard | None:
+    """Try the usual rates on the device `place`; the board that is found, or None.
+
+    Raises
+    ------
+    HilError
+        The port cannot be opened.
+    """
+    chosen = serial_drivers() if names is None else names
+    for baud in RATES:
+        heard = listen(f"serial:{place}:{baud}", chosen, listen_s)
+        if heard.driver:
+            return heard
+    return None
+
+
+def check_port(url: str, driver: str, patience_s: float = 1.0) -> str:
+    """Listen before a run; a warning to print, empty when `driver` understands what comes.
+
+    Raises
+    ------
+    HilError
+        The port cannot be opened, or another rate or driver is the right one: says which.
+    """
+    heard = listen(url, [driver], patience_s)
+    place = url.partition(":")[2].rpartition(":")[0]
+    if heard.driver or "://" in url:
+        return ""
+    found = probe(place)
+    if found is not None:
+        raise HilError(
+            f"{url}: no packet of {driver} in {patience_s:g} s ({heard.bytes} bytes came), "
+            f"but {found.driver} at {found.baud} baud: use --imu {found.driver} --bus serial:{place}:{found.baud}"
+        )
+    if heard.bytes:
+        return f"{url}: {heard.bytes} bytes in {patience_s:g} s, no packet of {driver}, and none of any board at the usual rates"
+    return f"{url}: nothing comes; is the board powered, its sending line wired, and set to send? hil configure {driver} ..."
