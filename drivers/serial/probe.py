@@ -40,7 +40,12 @@ class Heard:
 
 def serial_drivers() -> list[str]:
     """Names of the installed drivers of serial boards."""
-    return [name for name in driver_names() if isinstance(make_driver(name), SerialDriver)]
+    names = []
+    for name in driver_names():
+        with contextlib.suppress(ImportError):  # a broken driver of another package
+            if isinstance(make_driver(name), SerialDriver):
+                names.append(name)
+    return names
 
 
 def listen(url: str, names: list[str], seconds: float) -> Heard:
