@@ -14,7 +14,7 @@ from hil.geometry import attitude_difference, position_error
 from hil.scenario import Channel, MotionConfig, load
 from hil.study.aiding import gnss_rows
 from hil.world.motion import Motion
-from nav.aiding import Kind
+from nav.aiding import Kind, aiding_rows
 from nav.earth import RATE, normal_gravity
 from nav.errors import HilError
 from nav.filter.aided import Settings as FilterSettings
@@ -314,6 +314,17 @@ def test_batches_change_no_bit(cuts):
     edges = [0, *sorted(cuts), len(HAND)]
     parts = [split.process(HAND.rows(a, b)).copy() for a, b in pairwise(edges)]
     assert np.concatenate(parts).tobytes() == whole()
+
+
+def test_a_measurement_of_the_first_moment_leaves_the_captured_bias():
+    """It takes the filter back to its start, where the bias of the alignment must be known."""
+    found, imu = navigator(0.6, rest=False, bounds=None), board(DESK, 11.0, 0)
+    found.process(imu.rows(0, 10 * HZ + 2))
+    captured = found.gyro_bias.copy()
+    assert np.abs(captured).max() > 1e-3
+    found.aid(aiding_rows([10.01], Kind.HEADING, [0.6], [0.1]))
+    found.process(imu.rows(10 * HZ + 2, len(imu)))
+    np.testing.assert_allclose(found.gyro_bias, captured, atol=1e-6)
 
 
 @pytest.mark.parametrize("wrong", [(0.0, 1.0, 1.0), (1.0, -1.0, 1.0), (1.0, 1.0, math.inf)])
