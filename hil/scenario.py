@@ -299,6 +299,8 @@ class AssumeConfig(_Model):
     """From this speed on the vehicle may move as smoothly as it stands: no rest is assumed unless it is known to be slower."""
     bounds: BoundsConfig | None = None
     """Attitude and heading without a receiver: gravity is the vertical, velocity and place are bounded."""
+    wheels_ms: Positive | None = None
+    """A vehicle on wheels: it moves sideways and upwards by no more than this, one sigma, where the navigated point is."""
 
 
 class NavigationConfig(_Model):

@@ -96,7 +96,7 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
 
 def _assumptions_of(scenario: Scenario, believed: Tuning) -> Assumptions | None:
     assume, bounds = scenario.navigation.assume, scenario.navigation.assume.bounds
-    if assume.rest == "never" and bounds is None:
+    if assume.rest == "never" and bounds is None and assume.wheels_ms is None:
         return None
     rate_white, force_white = float(believed.white[:3].max()), float(believed.white[3:].max())
     return Assumptions(
@@ -104,6 +104,7 @@ def _assumptions_of(scenario: Scenario, believed: Tuning) -> Assumptions | None:
         assume.rest == "detected",
         assume.smooth_ms,
         None if bounds is None else Bounds(bounds.acceleration_ms2, bounds.speed_ms, bounds.place_m),
+        assume.wheels_ms,
     )
 
 

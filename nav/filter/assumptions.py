@@ -21,6 +21,8 @@ tau is given the white noise of the same power at low frequencies, s sqrt(2 tau 
 independent news. The acceleration's is the vertical, `Kind.GRAVITY`. In a manoeuvre it weighs less: s^2 grows by the squares of
 what the force differs from 1 g in length, of what it scatters by within the window (jerk), and of rate times `speed` (the turn).
 At rest it says nothing new and is left out, as is the velocity's.
+
+*Wheels* roll forwards: sideways and upwards the velocity is zero but for `wheels`, which lasts `SLIP_S`.
 """
 
 import math
@@ -44,6 +46,8 @@ SURE = 4.0
 """Sigmas within which rest must fit."""
 TREMOR_MS = 0.01
 """Velocity of a body at rest, one sigma of each axis, m/s."""
+SLIP_S = 1.0
+"""How long wheels slip the same way, s."""
 EVERY = 10
 """Strides between two rows of the bounds of velocity and place."""
 ITSELF = -1
@@ -78,12 +82,15 @@ class Assumptions:
         Speed from which on the vehicle may move as smoothly as it stands, m/s.
     bounds : Bounds, optional
         None: the vehicle may do anything.
+    wheels : float, optional
+        Velocity sideways and upwards of a vehicle on wheels, m/s, one sigma at the navigated point; None: it may move in any way.
     """
 
     stillness: Stillness
     rest: bool = True
     smooth: float = 5.0
     bounds: Bounds | None = None
+    wheels: float | None = None
 
 
 class Assumed:
@@ -109,8 +116,11 @@ class Assumed:
         self._strides += 1
         rest = self.settings.rest and self.detector.still and self._fits_rest(aided)
         rows = [self._rest_row(aided)] if rest else []
+        stride_s = self.settings.stillness.block_s * self.settings.stillness.stride
+        if self.settings.wheels is not None and not rest:
+            slip = self.settings.wheels * math.sqrt(2.0 * SLIP_S / stride_s)
+            rows.append(aiding(time, Kind.BODY_VELOCITY, (0.0,) * 3, (math.inf, slip, slip), ITSELF - 2))
         if bounds is not None:
-            stride_s = self.settings.stillness.block_s * self.settings.stillness.stride
             if not rest and self.detector.filled >= self.settings.stillness.stride:
                 rows.append(self._vertical(bounds, aided, stride_s))
             if self._strides % EVERY == 0:

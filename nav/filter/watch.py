@@ -111,7 +111,7 @@ class Watch:
                 self.ratio[_RATIOS[channel]] = max(self.ratio[_RATIOS[channel]], source.ratio)
         taken = False
         for found in self._aided.health:
-            taken = taken or (found.channel == Channel.GNSS_POSITION and found.accepted > 0)
+            taken = taken or (found.channel == Channel.GNSS_POSITION and found.source >= 0 and found.accepted > 0)
             self._tell(found)
         self.fixed = bool((self.fixed or taken) and np.hypot(self.sigma[0], self.sigma[1]) < SURE_M)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hil.geometry import attitude_difference, position_error
-from hil.scenario import Channel, MotionConfig, load
+from hil.scenario import Channel, MotionConfig, Sine, load
 from hil.study.aiding import gnss_rows
 from hil.world.motion import Motion
 from nav.aiding import Kind, aiding_rows
@@ -59,12 +59,12 @@ FINE, COARSE = (0.02, 50, 5), (0.1, 10, 1)
 """Intervals of the filter, s, blocks in the detector's window and in a stride; the coarse ones are five times as fast."""
 
 
-def navigator(heading, rest=True, bounds=BOUNDS, smooth=5.0, pace=FINE):
+def navigator(heading, rest=True, bounds=BOUNDS, smooth=5.0, pace=FINE, wheels=None):
     """As the bridge sets it up for a MEMS board that is levelled with its heading given."""
     predict_s, blocks, stride = pace
     noise = MEMS.gyro_white, MEMS.accelerometer_white
     stillness = Stillness(*noise, block_s=predict_s, blocks=blocks, stride=stride)
-    assumptions = Assumptions(stillness, rest, smooth, bounds)
+    assumptions = Assumptions(stillness, rest, smooth, bounds, wheels)
     sigma = np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, 10 * BIAS_TILT, 10 * BIAS_TILT, math.radians(0.2)])
     aiding = Aiding(tuning(MEMS, bias_removed=True), FilterSettings(predict_s), sigma, assumptions)
     start = {"lat": LAT, "lon": LON, "height": HEIGHT, "alignment": "level", "align_s": 10.0, "heading": heading}
@@ -314,6 +314,28 @@ def test_batches_change_no_bit(cuts):
     edges = [0, *sorted(cuts), len(HAND)]
     parts = [split.process(HAND.rows(a, b)).copy() for a, b in pairwise(edges)]
     assert np.concatenate(parts).tobytes() == whole()
+
+
+def test_wheels_hold_a_car_on_its_road_while_fixes_fail():
+    """East of a road to the north, a minute after the last fix: the tilt and the gyros carry away what has no wheels."""
+    road = Motion(MotionConfig(rest_s=12, ramp_s=8, north=Channel(rate=15, sines=(Sine(amplitude=20, period_s=17),))))
+    fixes = road.truth(np.arange(60.0, 350.0) / 5.0)
+    off = {}
+    for wheels in (None, 0.05):
+        errors = []
+        for seed in range(4):
+            found, imu = navigator(0.0, bounds=None, wheels=wheels, pace=COARSE), board(road, 130.0, seed)
+            rows = gnss_rows(fixes, np.random.default_rng(seed))
+            found.process(imu.rows(0, 11 * HZ))
+            found.aid(rows)
+            last = found.process(imu.rows(11 * HZ, len(imu)))[-1]
+            errors.append(
+                position_error(*(np.array([last[name]]) for name in ("lat", "lon", "height")), road.truth([130.0]))[0]
+            )
+            assert (np.abs(errors[-1]) < 4.0 * last["sigma"][:3]).all()
+        off[wheels] = np.sqrt(np.mean(np.square(errors), axis=0))
+    print(off)
+    assert off[0.05][1] < 0.3 * off[None][1]
 
 
 def test_a_measurement_of_the_first_moment_leaves_the_captured_bias():
