@@ -228,6 +228,56 @@ def decode(
 
 
 @app.command()
+def export(
+    file: Annotated[Path, typer.Argument(help="Recording of frames.")],
+    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet.")],
+    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Write the samples of a recording as a table, a column a signal."""
+    import numpy as np
+
+    from hil.samples import read_samples
+    from hil.tables import write_table
+
+    samples = read_samples(file, imu)
+    write_table(out, tuple(samples.columns), np.stack(list(samples.columns.values()), axis=1))
+    _report({"file": str(out), "samples": len(samples), "columns": list(samples.columns)}, as_json=as_json)
+    if samples.problem:
+        raise RunFailed(samples.problem)
+
+
+@app.command()
+def allan(
+    file: Annotated[Path, typer.Argument(help="Recording at rest, or a table as for `hil navigate`.")],
+    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
+    shortest: Annotated[
+        float, typer.Option("--from", min=0.0, help="Shortest time, s: above the lag of the rotors or of a filter.")
+    ] = 0.0,
+    plot: Annotated[Path | None, typer.Option(help="Plot the deviations to this file (.svg, .png).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Allan deviation of a recording at rest, and the coefficients that it shows."""
+    from hil.console import show_deviations
+    from hil.plot import check_plot, plot_deviations
+    from hil.samples import coefficients, deviations, read_samples
+
+    if plot is not None:
+        check_plot(plot)
+    samples = read_samples(file, imu)
+    fits, count, period = deviations(samples, shortest)
+    if plot is not None:
+        plot_deviations(plot, fits, file.name)
+    rows = [{"axis": name, **coefficients(name, fit)} for name, fit in fits.items()]
+    if as_json:
+        _report({"file": str(file), "samples": count, "left_out": len(samples) - count, "rows": rows}, as_json=True)
+    else:
+        show_deviations(f"{file.name}: {count} samples, {count * period:.6g} s", rows, len(samples) - count)
+    if samples.problem:
+        raise RunFailed(samples.problem)
+
+
+@app.command()
 def record(
     file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
     bus: Annotated[str, typer.Option(help="Bus URL.")],

@@ -181,3 +181,19 @@ def _print_spreads(console: Console, title: str, spreads: dict[str, dict[str, fl
     for name, spread in spreads.items():
         table.add_row(name, *(f"{spread[part]:.6g}" for part in ("rms", "max", "final")))
     console.print(table)
+
+
+def show_deviations(title: str, rows: list[dict[str, Any]], left_out: int) -> None:
+    """Coefficients of the Allan deviation by axis, gyros and accelerometers each in a table of their own."""
+    console = Console(highlight=False)
+    for kind in ("dtheta_", "dvel_"):
+        mine = [row for row in rows if row["axis"].startswith(kind)]
+        table = Table(title=title if kind == "dtheta_" else None)
+        for name in mine[0]:
+            table.add_column(name.replace("_", "\n", 1))
+        for row in mine:
+            axis, *values = row.values()
+            table.add_row(axis.removeprefix(kind), *(f"{value:.4g}" if value else "-" for value in values))
+        console.print(table)
+    if left_out:
+        console.print(f"{left_out} samples beyond gaps are left out: the longest stretch without one counts")

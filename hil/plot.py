@@ -1,5 +1,6 @@
 """Plots, through matplotlib (extra ``plot``)."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 
 from hil.reference import Reference
 from nav.errors import HilError
+from nav.instruments.allan import AllanFit
 from nav.rotation import euler_from_quaternion
 
 
@@ -58,6 +60,37 @@ def plot_difference(path: Path, reference: Reference, trace: Any, title: str) ->
     lower.legend()
     for axes in (upper, lower):
         axes.grid(alpha=0.3)
+    _save(figure, path)
+
+
+def plot_deviations(path: Path, fits: Mapping[str, AllanFit], title: str) -> None:
+    """Allan deviations of gyros and accelerometers, and the fitted curves.
+
+    Raises
+    ------
+    HilError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 8), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for axes, kind, scale, unit in (
+        (upper, "dtheta_", np.degrees(3600.0), "gyros, deg/h"),
+        (lower, "dvel_", 1e6 / 9.80665, "accelerometers, ug"),
+    ):
+        for number, (name, fit) in enumerate((n, f) for n, f in fits.items() if n.startswith(kind)):
+            axes.loglog(fit.tau, fit.deviation * scale, ".", color=f"C{number}", label=name.removeprefix(kind))
+            axes.loglog(fit.tau, fit.curve(fit.tau) * scale, "-", color=f"C{number}", linewidth=0.8)
+        axes.set_ylabel(unit)
+        axes.legend(fontsize="small")
+        axes.grid(alpha=0.3, which="both")
+    upper.set_title(f"Allan deviation, {title}")
+    lower.set_xlabel("tau, s")
+    _save(figure, path)
+
+
+def _save(figure: Any, path: Path) -> None:
     try:
         figure.savefig(path)
     except OSError as error:
