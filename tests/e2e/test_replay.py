@@ -1,23 +1,19 @@
 """A recording replays bit for bit, whatever its kind and speed; damaged and foreign files say what is wrong."""
 
-import contextlib
-import io
 import json
 import os
-import signal
 import time
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import can
+import commands
 import numpy as np
 import pytest
 
 from drivers.can.convert import to_message
 from drivers.can.frames import FrameArray
 from drivers.logs.recording import EVENT, RecordingReader, RecordingWriter
-from hil import cli
 from hil.pytest_plugin import StartBridge
 
 DURATION_S = 5.0
@@ -31,21 +27,8 @@ CHANGES: dict[str, Any] = {
 
 def replay(*arguments: object, code: int = 0) -> tuple[dict[str, Any], str]:
     """``hil replay``: its summary and what it said."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    out, err, ended = io.StringIO(), io.StringIO(), 0
-    with (
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        mock.patch("sys.argv", ["hil", "replay", *map(str, arguments), "--mavlink", "none", "--json"]),
-    ):
-        try:
-            cli.main()
-        except SystemExit as end:
-            ended = int(end.code or 0)
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    assert ended == code, err.getvalue()
-    return (json.loads(out.getvalue()) if out.getvalue() else {}), err.getvalue()
+    out, err = commands.hil("replay", *arguments, "--mavlink", "none", "--json", code=code)
+    return (json.loads(out) if out else {}), err
 
 
 def read(path: Path) -> tuple[FrameArray, dict[str, Any], str]:

@@ -1,17 +1,15 @@
 """A real board's bytes on a pseudo-terminal, through the loop: aligned, navigated, recorded, replayed to the same bit."""
 
 import contextlib
-import io
 import json
-import signal
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
+import commands
 import numpy as np
 import pytest
 from serial.tools.list_ports_common import ListPortInfo
@@ -23,7 +21,6 @@ from drivers import driver_names
 from drivers.can.bus import open_port
 from drivers.can.frames import FrameArray, frames
 from drivers.logs.recording import RecordingWriter
-from hil import cli
 from hil.bridge import Loop, LoopOrder, Outlets
 from hil.decoder import decode_file, record_bus
 from hil.scenario import Scenario
@@ -157,22 +154,9 @@ class Feeder:
 
 
 def hil(*arguments: object, code: int = 0) -> tuple[dict[str, Any], str]:
-    """``hil ARGUMENT... --json`` in this process: its summary and what it said."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    out, err, ended = io.StringIO(), io.StringIO(), 0
-    with (
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        mock.patch("sys.argv", ["hil", *map(str, arguments), "--json"]),
-    ):
-        try:
-            cli.main()
-        except SystemExit as end:
-            ended = int(end.code or 0)
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    assert ended == code, err.getvalue()
-    return (json.loads(out.getvalue()) if out.getvalue() else {}), err.getvalue()
+    """``hil ARGUMENT... --json``: its summary and what it said."""
+    out, err = commands.hil(*arguments, "--json", code=code)
+    return (json.loads(out) if out else {}), err
 
 
 def test_the_command_runs_records_and_replays_a_board(port_file: Path, tmp_path: Path) -> None:

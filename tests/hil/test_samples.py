@@ -1,21 +1,17 @@
 """`hil export` and `hil allan`: what is in a recording, as a table and as noise."""
 
-import contextlib
-import io
 import json
-import signal
 from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
+from commands import hil
 
 from drivers import make_driver
 from drivers.can.frames import FrameArray
 from drivers.logs.recording import RecordingWriter
-from hil import cli
 from hil.offline import IMU_HEADER
 from hil.samples import deviations, read_samples
 from hil.scenario import Scenario
@@ -26,24 +22,6 @@ from nav.instruments.grades import GRADES
 SCENARIO = Scenario.model_validate(
     {"bus": "unix:none", "head": {"rate_hz": 100, "instruments": "dtg", "grade": "mems"}}
 )
-
-
-def hil(*arguments: object, code: int = 0) -> tuple[str, str]:
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    out, err, ended = io.StringIO(), io.StringIO(), 0
-    with (
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        mock.patch("sys.argv", ["hil", *map(str, arguments)]),
-    ):
-        try:
-            cli.main()
-        except SystemExit as end:
-            ended = int(end.code or 0)
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    assert ended == code, err.getvalue()
-    return out.getvalue(), err.getvalue()
 
 
 @cache
