@@ -111,7 +111,7 @@ BAD_TOML = "[navigation\nalign_s = 3"
         (
             ["imu", "no-such"],
             "",
-            "scenario no-such: No such file or directory; give a TOML file or one of: aided, coning, default",
+            "scenario no-such: No such file or directory; give a TOML file or one of: aided, airstart, coning, default",
         ),
         (["run", "--speed", "3"], "", "--speed 3: expected 1 or max"),
         (["run", "--speed", "max", "--bus", "unix:a"], "", "--speed max needs the simulated head of `hil run`"),

@@ -87,7 +87,7 @@ def test_what_cannot_be_smoothed(frames, tmp_path):
     bare = write(tmp_path / "bare.dhil", frames[~is_aiding(frames["can_id"])][:3000])
     with pytest.raises(HilError, match=r"nothing in .* aids the navigator"):
         smooth_recording(bare, SCENARIO, out)
-    moving = SCENARIO.with_changes(navigation={"alignment": "gyrocompass"})
+    moving = SCENARIO.with_changes(navigation={"alignment": "gyrocompass"}, head={"grade": "dtg"})
     with pytest.raises(HilError, match="alignment does not end"):
         smooth_recording(write(tmp_path / "flight.dhil", frames[:3000]), moving, out)
     with pytest.raises(HilError, match="No such file"):
