@@ -45,7 +45,7 @@ TILT = {"dtg": (0.01 * _DEG, 0.1 * _DEG), "tactical": (0.1 * _DEG, 0.5 * _DEG), 
 Instruments = Literal["own", "full"]
 OWN = Settings(predict_s=0.1)
 """For the own instruments: five times longer intervals than usual, for there are many runs."""
-CAMPAIGNS = 10
+CAMPAIGNS = 30
 """Of the own instruments: errors live for half a minute, so that the epochs of one campaign are few that are independent."""
 SEEDS, SETTLED_S, OUTAGE_S = 50, 60.0, (120.0, 180.0)
 LIMITS_DEG = {"dtg": (0.01, 0.06), "tactical": (0.05, 0.2), "mems": (0.2, 1.0)}

@@ -68,7 +68,7 @@ def test_replay_is_bit_identical(recorded: tuple[Path, dict[str, Any]], speed: s
     assert summary["gyro_bias_deg_h"] == live["gyro_bias_deg_h"]
     assert live["recorder"]["frames"] == summary["frames"]
     if speed == "1":
-        assert summary["wall_s"] == pytest.approx(DURATION_S, abs=1.0)
+        assert DURATION_S - 0.5 < summary["wall_s"] < DURATION_S + 5.0  # it keeps the pace; a busy machine ends it late
 
 
 def test_simulated_time_gives_the_same_frames(recorded: tuple[Path, dict[str, Any]], hil_bridge: StartBridge) -> None:

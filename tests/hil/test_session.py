@@ -89,7 +89,7 @@ def test_paced_run_keeps_time_and_measures_latency(hil_bridge: StartBridge) -> N
 
 
 def test_links_are_optional_and_counted(hil_bridge: StartBridge) -> None:
-    bridge = hil_bridge(navigation=TRUTH, head={"rate_hz": 100}, duration_s=2)
+    bridge = hil_bridge(navigation=TRUTH, head={"rate_hz": 100}, duration_s=5)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ground:
         assert bridge.mavlink_port
         ground.bind(("127.0.0.1", bridge.mavlink_port))
