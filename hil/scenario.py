@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
@@ -158,6 +158,12 @@ class Outage(_Model):
 
     start_s: NotNegative
     end_s: Positive
+
+    @model_validator(mode="after")
+    def _forward(self) -> Self:
+        if self.end_s <= self.start_s:
+            raise ValueError(f"it ends at {self.end_s:g} s, not after its start at {self.start_s:g} s")
+        return self
 
 
 class Jump(_Model):

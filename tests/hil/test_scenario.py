@@ -100,3 +100,9 @@ def test_the_worlds_fingerprint_is_of_the_world_alone():
         {"head": {"mounting_deg": [1, 0, 0]}},
     ]
     assert len({base.with_changes(**change).world_id() for change in different} | {base.world_id()}) == 5
+
+
+def test_an_outage_ends_after_it_starts() -> None:
+    withheld = 'navigation.filter.withheld = [{ kind = "gnss", start_s = 20, end_s = 10 }]'
+    with pytest.raises(HilError, match=r"withheld\.0: .*ends at 10 s, not after its start at 20 s"):
+        parse(withheld, "mine.toml")
