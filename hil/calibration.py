@@ -15,6 +15,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
 from hil.scenario import Finite, RotorConfig, Vector, explained
+from nav.earth import STANDARD_GRAVITY as _G
 from nav.errors import HilError
 from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.calibration import ACCELEROMETER_TERMS, CASES, GYRO_TERMS, POWERS, Calibration
@@ -26,7 +27,6 @@ from nav.instruments.gyro_errors import GyroErrors
 _DEG_H = math.radians(1.0) / 3600.0
 _ARCSEC = _DEG_H
 _PPM = 1e-6
-_G = 9.80665
 UNITS = {
     "gyro": {
         "bias": ("deg_h", _DEG_H),

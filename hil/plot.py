@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from hil.reference import Reference
+from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 from nav.instruments.allan import AllanFit
 from nav.rotation import euler_from_quaternion
@@ -77,7 +78,7 @@ def plot_deviations(path: Path, fits: Mapping[str, AllanFit], title: str) -> Non
     upper, lower = figure.subplots(2, 1, sharex=True)
     for axes, kind, scale, unit in (
         (upper, "dtheta_", np.degrees(3600.0), "gyros, deg/h"),
-        (lower, "dvel_", 1e6 / 9.80665, "accelerometers, ug"),
+        (lower, "dvel_", 1e6 / STANDARD_GRAVITY, "accelerometers, ug"),
     ):
         for number, (name, fit) in enumerate((n, f) for n, f in fits.items() if n.startswith(kind)):
             axes.loglog(fit.tau, fit.deviation * scale, ".", color=f"C{number}", label=name.removeprefix(kind))

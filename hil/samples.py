@@ -13,6 +13,7 @@ from drivers.logs.recording import EVENT, RecordingReader
 from hil.offline import IMU_HEADER
 from hil.source import FileSource, is_own
 from hil.tables import read_table
+from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements
 from nav.instruments.allan import AllanFit, allan
@@ -111,7 +112,7 @@ def coefficients(axis: str, fit: AllanFit) -> dict[str, float]:
             "walk_deg_h_sqrt_h": fit.walk * deg * 3600.0 * 60.0,
             "ramp_deg_h_h": fit.ramp * deg * 3600.0**2,
         }
-    micro_g = 1e-6 * 9.80665
+    micro_g = 1e-6 * STANDARD_GRAVITY
     return {
         "rounding_ms": fit.rounding,
         "white_ug_sqrt_hz": fit.white / micro_g,

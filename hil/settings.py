@@ -11,6 +11,7 @@ from hil.magnetic import magnetic_field
 from hil.scenario import Scenario
 from hil.world.instruments import axis_drift, mounting, sensors_of
 from nav.alignment.rest import UNSTATED
+from nav.earth import STANDARD_GRAVITY
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.assumptions import Assumptions, Bounds
 from nav.filter.states import GYRO_BIAS, SENSOR_BLOCKS, Block, Tuning, tuning
@@ -65,7 +66,7 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
         grade = replace(grade, gyro_white=math.radians(chosen.gyro_deg_sqrt_h) / 60.0)
     if chosen.accelerometer_ms_sqrt_h is not None:
         grade = replace(grade, accelerometer_white=chosen.accelerometer_ms_sqrt_h / 60.0)
-    tilt = max(math.radians(0.01), grade.accelerometer_bias / 9.80665)
+    tilt = max(math.radians(0.01), grade.accelerometer_bias / STANDARD_GRAVITY)
     removed = scenario.navigation.alignment not in ("moving", "transfer")
     field_n = magnetic_field(aiding.field, lat, lon, height, aiding.year)
     if chosen.declination_deg is not None:

@@ -26,6 +26,8 @@ GE = 9.7803253359
 """Normal gravity at the equator, m/s^2."""
 GP = 9.8321849378
 """Normal gravity at the pole, m/s^2."""
+STANDARD_GRAVITY = 9.80665
+"""What sensors and their data sheets call 1 g, m/s^2."""
 
 _K = B * GP / (A * GE) - 1.0
 _M = RATE * RATE * A * A * B / GM

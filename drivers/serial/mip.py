@@ -14,6 +14,7 @@ from itertools import accumulate
 from drivers.serial.dialog import Dialog, check_line
 from drivers.serial.driver import Reading, SerialDriver, Three
 from drivers.serial.stream import MORE, NONE
+from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 
 SYNC = b"\x75\x65"
@@ -24,7 +25,6 @@ GPS_TIME, GPS_TIME_SHARED, REFERENCE_TIME, REFERENCE_STEP, OVERRANGE = 0x12, 0xD
 IDLE, RESUME, BASE_RATE, FORMAT, STREAM, ACKNOWLEDGE = 0x02, 0x06, 0x0E, 0x0F, 0x11, 0xF1
 WRITE, READ = 0x01, 0x02
 """Function selectors."""
-G = 9.80665
 _WEEK_NS = 604_800 * 10**9
 _VECTORS = {ACCELERATION, RATE, DELTA_THETA, DELTA_VELOCITY}
 _OVERRANGED = 0x0077
@@ -99,7 +99,7 @@ class Mip:
         return Reading(
             time_ns=time_ns,
             turn=_three(fields[turn]),
-            push=(force[0] * G, force[1] * G, force[2] * G),
+            push=(force[0] * STANDARD_GRAVITY, force[1] * STANDARD_GRAVITY, force[2] * STANDARD_GRAVITY),
             coned=coned,
             step_ns=struct.unpack(">Q", step)[0] if len(step) == 8 else 0,
             suspect=len(overrange) == 2 and bool(struct.unpack(">H", overrange)[0] & _OVERRANGED),

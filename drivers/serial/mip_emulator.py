@@ -8,6 +8,7 @@ from drivers.serial import mip
 from drivers.serial.chunks import to_chunks
 from drivers.serial.increments import from_integrals
 from drivers.serial.stream import ByteStream
+from nav.earth import STANDARD_GRAVITY
 from nav.increments import ImuIncrements
 
 _UNKNOWN, _BAD_PARAMETER = 0x01, 0x03
@@ -42,14 +43,14 @@ class MipEmulator:
                 fields = [
                     (mip.REFERENCE_TIME, struct.pack(">Q", time)),
                     (mip.DELTA_THETA, struct.pack(">3f", *phi[k])),
-                    (mip.DELTA_VELOCITY, struct.pack(">3f", *(u[k] / mip.G))),
+                    (mip.DELTA_VELOCITY, struct.pack(">3f", *(u[k] / STANDARD_GRAVITY))),
                 ]
             else:
                 rate, force = imu.dtheta[k] / imu.step[k], imu.dvel[k] / imu.step[k]
                 fields = [
                     (mip.GPS_TIME, struct.pack(">dHH", imu.time[k], 2300, 7)),
                     (mip.RATE, struct.pack(">3f", *rate)),
-                    (mip.ACCELERATION, struct.pack(">3f", *(force / mip.G))),
+                    (mip.ACCELERATION, struct.pack(">3f", *(force / STANDARD_GRAVITY))),
                 ]
             if overrange:
                 fields.append((mip.OVERRANGE, struct.pack(">H", overrange)))

@@ -17,6 +17,7 @@ from hil.scenario import Cone, MotionConfig
 from hil.study.navigation.flights import configuration
 from hil.study.report import Line, Plot, Row, Study, at_most, near, shown
 from hil.world.motion import Motion
+from nav.earth import STANDARD_GRAVITY as G
 from nav.increments import FloatArray
 from nav.rotation import attitude_error, dcm_from_quaternion
 from nav.strapdown import Strapdown
@@ -29,7 +30,6 @@ AMPLIFIED_S, DRAWS = 60.0, 8
 CHOICE_S, CHOICE_DRAWS = 600.0, 24
 SHARE = 0.1
 """A method is exact enough where it leaves out less than this share of the error due to noise."""
-G = 9.80665
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from hil.calibration import CalibrationFile, rotor_of
 from hil.scenario import HeadConfig, Scenario
 from hil.world.motion import Motion
 from nav.alignment.rest import UNSTATED, Sensors
+from nav.earth import STANDARD_GRAVITY as _G
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.accelerometer_errors import AccelerometerErrors, Accelerometers
@@ -39,7 +40,6 @@ BLOCK_OFFSET_M = 0.03
 """How far the level pendulums' hinges of the simulated block lie out of its centre."""
 GYRO_RANGE = math.radians(180.0)
 """The torquers saturate here, rad/s."""
-_G = 9.80665
 _TURN_ON = ("gyro_bias", "gyro_scale", "gyro_misalignment", "gyro_g", "accelerometer_bias", "accelerometer_scale")
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.kernel import kernel
@@ -159,7 +160,7 @@ def progress(sums: FloatArray, goal_s: float) -> float:
 
 def gravity_verdict(f_b: FloatArray) -> str | None:
     """What is wrong with the specific force at rest (3,), m/s^2; None when it is 1 g to five per cent."""
-    g = float(np.linalg.norm(f_b)) / 9.80665
+    g = float(np.linalg.norm(f_b)) / STANDARD_GRAVITY
     if math.isfinite(g) and abs(g - 1.0) <= 0.05:
         return None
     return f"specific force at rest is {g:.2f} g: units or signs?"

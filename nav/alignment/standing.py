@@ -10,6 +10,7 @@ from nav.aiding import Kind
 from nav.alignment import rest
 from nav.alignment.analytic import Alignment, AlignmentRefused, gyrocompass, level
 from nav.alignment.plan import GIVEN_UP, Plan, Start, Word, place_of_sensor
+from nav.earth import STANDARD_GRAVITY
 from nav.increments import FloatArray, ImuIncrements
 from nav.state import Health
 
@@ -76,7 +77,7 @@ class AtRest:
             return Word(complaints, Health.MOVING)
         sigma = np.concatenate([np.zeros(6), np.sqrt(np.diag(result.covariance))])
         place = place_of_sensor(self._place, result.q_nb, self._plan.lever_arm)
-        remark = f"{np.linalg.norm(mean.f) / 9.80665:.3f} g"
+        remark = f"{np.linalg.norm(mean.f) / STANDARD_GRAVITY:.3f} g"
         start = Start(time, place, np.zeros(3), result.q_nb, result.gyro_bias, sigma, mean.time_s, remark)
         return Word(complaints, GIVEN_UP, start=start)
 

@@ -27,6 +27,7 @@ from enum import Enum
 
 import numpy as np
 
+from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 from nav.instruments.grades import Grade
@@ -45,7 +46,7 @@ STATES = 35
 
 FLICKER_S = 10.0
 TURN_S = 10.0
-LEVEL = 9.80665
+LEVEL = STANDARD_GRAVITY
 """Specific force of level flight, up, m/s^2."""
 
 

@@ -24,12 +24,11 @@ from typing import Protocol
 
 import numpy as np
 
-from nav.earth import A
+from nav.earth import STANDARD_GRAVITY, A
 from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.kernel import kernel
 
-GRAVITY = 9.80665
 STEADY = 1e-10
 """The covariance stands when a step changes no variance by more than this share."""
 LONGEST = 10_000_000
@@ -142,7 +141,7 @@ def steady(noise: Noise) -> SteadyGains:
     """Gains of the steady Kalman filter that considers drift and bias; see the module."""
     gyro, force = noise.gyro_white**2, noise.accelerometer_white**2
     f = np.zeros((5, 5))  # place, velocity, tilt | bias, drift
-    f[0, 1], f[1, 2], f[1, 3], f[2, 1], f[2, 4] = 1.0, GRAVITY, 1.0, -1.0 / A, 1.0
+    f[0, 1], f[1, 2], f[1, 3], f[2, 1], f[2, 4] = 1.0, STANDARD_GRAVITY, 1.0, -1.0 / A, 1.0
     considered = noise.accelerometer_bias, noise.gyro_drift
     sigma = noise.place[0], noise.velocity[0], noise.tilt
     level = _steady(f, np.array([0.0, force, gyro]), considered, sigma, noise.period)

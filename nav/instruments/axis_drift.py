@@ -7,11 +7,11 @@ upright feels none of it and the other one all of it: their mean is worse than t
 
 import numpy as np
 
+from nav.earth import STANDARD_GRAVITY as _G
 from nav.increments import FloatArray
 from nav.instruments.grades import Grade
 from nav.instruments.redundancy import layout
 
-_G = 9.80665
 _SPIN = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
 """Spin axes of the gyros of g1x, g1y, g2y, g2z, in head axes."""
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from nav.earth import STANDARD_GRAVITY as _G
 from nav.increments import FloatArray
 
 _DEG_H = math.radians(1.0) / 3600.0
-_G = 9.80665
 REQUIRED = {
     "gyro": {
         "bias": 10.0 * _DEG_H,

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nav.earth import STANDARD_GRAVITY as _G
 from nav.instruments.accelerometer_errors import AccelerometerErrors
 from nav.instruments.channels import TRIAD, Triple
 from nav.instruments.gyro_errors import DTG_HEAD, GyroErrors
@@ -15,7 +16,6 @@ _DEG_H = _DEG / 3600.0
 _DEG_SQRT_H = _DEG / 60.0
 _ARCSEC = _DEG / 3600.0
 _PPM = 1e-6
-_G = 9.80665
 
 
 @dataclass(frozen=True, slots=True)

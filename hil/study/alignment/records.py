@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from hil.world.motion import Motion
 from nav.aiding import AIDING, Kind
 from nav.alignment.rest import Sensors
-from nav.earth import curvature_radii
+from nav.earth import STANDARD_GRAVITY, curvature_radii
 from nav.filter.gnss_attitude import GnssAttitude, attitude
 from nav.frames import level_in_earth
 from nav.increments import FloatArray, ImuIncrements
@@ -22,7 +22,6 @@ from nav.rotation import rotated
 
 STEP = 0.02
 """Of the sensors, s."""
-GRAVITY = 9.80665
 FIX_S, PLACE_M, SPEED = 0.2, 1.5, 0.1
 """Of GNSS: time between fixes, s; noise of position and velocity an axis, m and m/s."""
 PHASE_M, WAVELENGTH_M = 5e-3, 0.1903
@@ -45,7 +44,7 @@ def sensors(grade: Grade) -> Sensors:
 
     Gravity drifts the level gyros like a bias, but for those of a head, see `weighted`.
     """
-    by_gravity = grade.gyro_g * GRAVITY
+    by_gravity = grade.gyro_g * STANDARD_GRAVITY
     level = 0.0 if grade.gyro_channels == DTG_HEAD else by_gravity
     return Sensors(
         grade.gyro_white,

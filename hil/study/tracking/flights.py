@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from hil.geometry import attitude_difference, position_error
 from hil.scenario import Channel, MotionConfig
 from hil.study.aiding import GNSS_SIGMA, gnss_rows, moved, turns
-from hil.study.alignment.records import FIX_S, GRAVITY, four_antennas, ideal, sensed, sky
+from hil.study.alignment.records import FIX_S, four_antennas, ideal, sensed, sky
 from hil.world.motion import Motion
 from nav.aiding import AIDING
+from nav.earth import STANDARD_GRAVITY
 from nav.filter.gnss_attitude import GnssAttitude
 from nav.filter.tracking_gains import Noise
 from nav.increments import FloatArray, ImuIncrements
@@ -105,9 +106,9 @@ def noise(grade: Grade, flight: Flight) -> Noise:
     north, east, down = np.diag(covariance)
     return Noise(
         gyro_white=grade.gyro_white,
-        gyro_drift=math.hypot(grade.gyro_bias_removed, grade.gyro_g * GRAVITY, by_rate),
+        gyro_drift=math.hypot(grade.gyro_bias_removed, grade.gyro_g * STANDARD_GRAVITY, by_rate),
         accelerometer_white=grade.accelerometer_white,
-        accelerometer_bias=math.hypot(grade.accelerometer_bias, grade.accelerometer_scale * GRAVITY),
+        accelerometer_bias=math.hypot(grade.accelerometer_bias, grade.accelerometer_scale * STANDARD_GRAVITY),
         place=(float(GNSS_SIGMA[0]), float(GNSS_SIGMA[2])),
         velocity=(float(GNSS_SIGMA[3]), float(GNSS_SIGMA[5])),
         tilt=math.sqrt(0.5 * (north + east)),
