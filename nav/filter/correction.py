@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nav.aiding import Kind
+from nav.chi_square import quantile
 from nav.filter import health as gates
 from nav.filter import measurements as models
 from nav.filter.error_state import MEASURED, ErrorState
@@ -78,7 +79,7 @@ class Correction:
     def __init__(self, core: Strapdown, tuning: Tuning, settings: Settings, recorder: Recorder | None) -> None:
         self.settings, self.filter, self.time = settings, ErrorState(tuning), -math.inf
         self._core, self._recorder = core, recorder
-        self._gate = [gates.quantile(settings.gate, m + 1) for m in range(MEASURED)]
+        self._gate = [quantile(settings.gate, m + 1) for m in range(MEASURED)]
         self._field = np.zeros(3) if settings.field_n is None else np.array(settings.field_n, float)
         self._declination = math.atan2(self._field[1], self._field[0])
         self.estimates, self._known, self._sigma = np.zeros(STATES), np.zeros(STATES), np.zeros(9)

@@ -14,7 +14,6 @@ Means are exponential over about 1 / `SHARE` measurements. No component counts f
 import math
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
-from statistics import NormalDist
 
 from nav.increments import FloatArray
 from nav.kernel import kernel
@@ -89,19 +88,6 @@ def clear(row: FloatArray) -> None:
     """Begin to judge a source."""
     row[:] = 0.0
     row[NIS_MEAN], row[SPREAD], row[SINCE] = 1.0, 1.0, math.nan
-
-
-def quantile(probability: float, freedom: int) -> float:
-    """Chi-square quantile of 1, 2 or 3 degrees of freedom."""
-    if freedom == 1:
-        return NormalDist().inv_cdf(0.5 + 0.5 * probability) ** 2
-    if freedom == 2:
-        return -2.0 * math.log1p(-probability)
-    x = -2.0 * math.log1p(-probability) + 2.0
-    for _ in range(20):  # Newton on F = erf sqrt(x / 2) - 2 p(x), p the density
-        density = math.sqrt(x / (2.0 * math.pi)) * math.exp(-0.5 * x)
-        x -= (math.erf(math.sqrt(0.5 * x)) - 2.0 * density - probability) / density
-    return x
 
 
 def inflation(row: FloatArray) -> float:

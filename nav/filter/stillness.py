@@ -18,10 +18,10 @@ both is above its `leave` quantile. What is known of a stride is known at its la
 
 import math
 from dataclasses import dataclass, fields
-from statistics import NormalDist
 
 import numpy as np
 
+from nav.chi_square import quantile
 from nav.errors import HilError
 from nav.increments import FloatArray, ImuIncrements, IntArray, Validity
 from nav.kernel import kernel
@@ -84,12 +84,6 @@ class Stillness:
         return np.repeat([rate, force], 3)
 
 
-def chi_square_quantile(probability: float, freedom: int) -> float:
-    """Of many degrees of freedom, by Wilson & Hilferty: within 4 per cent up to 1 - 1e-6, from 6 of them on."""
-    share = 2.0 / (9.0 * freedom)
-    return freedom * (1.0 - share + NormalDist().inv_cdf(probability) * math.sqrt(share)) ** 3
-
-
 class StillnessDetector:
     """See the module.
 
@@ -117,8 +111,8 @@ class StillnessDetector:
         self.settings = settings
         self._variance = settings.variance
         n = settings.blocks
-        self._enter = chi_square_quantile(settings.enter, 6 * (n - 1))
-        self._leave = chi_square_quantile(settings.leave, 6 * (n - 1)), chi_square_quantile(settings.leave, 6)
+        self._enter = quantile(settings.enter, 6 * (n - 1))
+        self._leave = quantile(settings.leave, 6 * (n - 1)), quantile(settings.leave, 6)
         self._sums, self._ring, self._count = np.zeros(7), np.zeros((n, 6)), np.zeros(3, np.int64)
         self.mean, self.spread, self.newest = np.zeros(6), np.zeros(6), np.zeros(6)
         self.clear()

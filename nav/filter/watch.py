@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from nav.chi_square import quantile
 from nav.filter.aided import AidedNavigator, Judged
-from nav.filter.health import Channel, ChannelHealth, Trust, quantile
+from nav.filter.health import Channel, ChannelHealth, Trust
 from nav.increments import FloatArray
 from nav.state import Ratio
 

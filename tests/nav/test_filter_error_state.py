@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from nav.chi_square import quantile
 from nav.earth import RATE, normal_gravity
 from nav.error_dynamics import fill_dynamics, fill_input, fill_transition
 from nav.errors import HilError
 from nav.filter.error_state import ErrorState
-from nav.filter.health import quantile
 from nav.filter.states import STATES, TURN_S, Block, Tuning, correct_increments, places, tuning
 from nav.instruments.channels import TRIAD
 from nav.instruments.grades import GRADES

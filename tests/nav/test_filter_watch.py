@@ -9,9 +9,9 @@ import pytest
 from hil.geometry import position_error
 from hil.study.aiding import gnss_rows, record
 from hil.study.navigation.flights import flight
+from nav.chi_square import quantile
 from nav.filter import watch
 from nav.filter.aided import Settings as FilterSettings
-from nav.filter.health import quantile
 from nav.filter.states import tuning
 from nav.instruments.grades import GRADES
 from nav.navigator import Aiding, Navigator, Settings

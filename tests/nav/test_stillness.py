@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from nav.chi_square import quantile
 from nav.errors import HilError
-from nav.filter.stillness import Stillness, StillnessDetector, chi_square_quantile
+from nav.filter.stillness import Stillness, StillnessDetector
 from nav.increments import ImuIncrements, Validity
 
 STEP = 0.01
@@ -48,9 +49,7 @@ def decisions(detector, imu):
 def test_the_quantile_is_that_of_chi_square():
     for freedom in (6, 54, FREEDOM):
         for probability in (0.9, 0.99, 1.0 - 1e-6):
-            assert chi_square_quantile(probability, freedom) == pytest.approx(
-                stats.chi2.ppf(probability, freedom), rel=0.04
-            )
+            assert quantile(probability, freedom) == pytest.approx(stats.chi2.ppf(probability, freedom), rel=0.04)
 
 
 def test_at_rest_both_statistics_are_chi_square():
