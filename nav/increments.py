@@ -88,6 +88,12 @@ class ImuIncrements:
             self.sequence[start:stop],
         )
 
+    def fill(self, source: "ImuIncrements") -> None:
+        """Take the values of as many samples."""
+        self.time[:], self.step[:] = source.time, source.step
+        self.dtheta[:], self.dvel[:] = source.dtheta, source.dvel
+        self.validity[:], self.sequence[:] = source.validity, source.sequence
+
     @staticmethod
     def empty(n: int) -> "ImuIncrements":
         """Room for `n` samples."""

@@ -144,8 +144,7 @@ class SerialDriver:
     def _grow(self) -> None:
         old, coned, arrivals, n = self._batch, self._coned, self._arrivals, self._count
         self._room(2 * n)
-        for name in ("time", "step", "dtheta", "dvel", "validity", "sequence"):
-            getattr(self._batch, name)[:n] = getattr(old, name)
+        self._batch.rows(0, n).fill(old)
         self._coned[:n], self._arrivals[:n] = coned, arrivals
 
 

@@ -27,20 +27,14 @@ class Held:
         n, before = self._count + len(imu), self.rows
         if n > len(self._room):
             self._room = ImuIncrements.empty(2 * n)
-            _copy(before, self._room.rows(0, self._count))
-        _copy(imu, self._room.rows(self._count, n))
+            self._room.rows(0, self._count).fill(before)
+        self._room.rows(self._count, n).fill(imu)
         self._count = n
 
     def drop(self, n: int) -> None:
         """Hold the oldest `n` no longer."""
-        left = self._room.rows(n, self._count)
-        _copy(left, self._room.rows(0, self._count - n))
+        self._room.rows(0, self._count - n).fill(self._room.rows(n, self._count))
         self._count -= n
-
-
-def _copy(source: ImuIncrements, target: ImuIncrements) -> None:
-    for name in ImuIncrements.__dataclass_fields__:
-        getattr(target, name)[:] = getattr(source, name)
 
 
 def turn_between(imu: ImuIncrements, before: float, after: float) -> FloatArray:

@@ -253,7 +253,7 @@ class AidedNavigator:
         row, n = self._count - self._first, len(imu)
         if row + n > len(self._samples):
             row = self._make_way(n)
-        _copy(imu, self._samples.rows(row, row + n))
+        self._samples.rows(row, row + n).fill(imu)
         self._count += n
 
     def _make_way(self, n: int) -> int:
@@ -262,7 +262,7 @@ class AidedNavigator:
         kept = self._count - self._memories[0].number
         if 2 * (kept + n) > len(old):
             self._samples = ImuIncrements.empty(2 * (kept + n))
-        _copy(old.rows(oldest, oldest + kept), self._samples.rows(0, kept))
+        self._samples.rows(0, kept).fill(old.rows(oldest, oldest + kept))
         self._first += oldest
         return kept
 
@@ -335,8 +335,3 @@ class AidedNavigator:
         if n > len(self._turned):
             self._room(2 * n)
         return Answers(*(array[:n] for array in self._out))
-
-
-def _copy(source: ImuIncrements, target: ImuIncrements) -> None:
-    target.time[:], target.step[:] = source.time, source.step
-    target.dtheta[:], target.dvel[:] = source.dtheta, source.dvel
