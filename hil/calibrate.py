@@ -13,14 +13,12 @@ from typing import Any
 import numpy as np
 
 from drivers import FrameDriver, make_driver
-from drivers.can.frames import frames
-from drivers.logs.recording import EVENT, RecordingReader
 from hil.calibration import CHANNELS, NO_HEAD, CalibrationFile, from_fit, rotor_of, validated
 from hil.calibration_sequence import PositionConfig, Say, SequenceConfig, TurnConfig, read_sequence
 from hil.magnetometer import fit as fit_magnetometer
 from hil.scenario import Scenario, load
 from hil.scenario import validated as validated_scenario
-from hil.source import FileSource, is_own
+from hil.source import FileSource, is_own, scenario_table
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements
 from nav.instruments.calibration_fit import fit
@@ -132,21 +130,18 @@ def _head(
 def _scenario_of(path: Path) -> Scenario:
     if not is_own(path):
         return load(None)
-    reader = RecordingReader.open(path)
-    reader.close()
-    table = reader.header.get("scenario")
-    return validated_scenario(table, f"in recording {path}") if isinstance(table, dict) else load(None)
+    table = scenario_table(path)
+    return load(None) if table is None else validated_scenario(table, f"in recording {path}")
 
 
 def _samples(path: Path) -> tuple[HeadIncrements, FrameDriver, datetime.date]:
     """All samples of a recording, its driver, and the day of its first frame."""
-    source, driver, batch = FileSource(path, paced=False), make_driver("dtg-head"), frames(4096)
+    source, driver = FileSource(path, paced=False), make_driver("dtg-head")
     parts: list[HeadIncrements] = []
     began = 0
-    while n := source.receive(batch, 0.0):
-        good = batch[:n][batch["reserved"][:n, 0] != EVENT]
-        began = began or int(good["time_ns"][0]) if len(good) else began
-        got = driver.decode(good)
+    for batch in source.batches(4096):
+        began = began or int(batch["time_ns"][0]) if len(batch) else began
+        got = driver.decode(batch)
         if isinstance(got, HeadIncrements):
             parts.append(HeadIncrements(*(getattr(got, field.name).copy() for field in fields(got))))
     if source.problem():

@@ -13,7 +13,7 @@ from drivers import make_driver
 from drivers.can.bus import open_port
 from drivers.can.convert import to_message
 from drivers.can.frames import frames
-from drivers.logs.recording import EVENT, RecordingWriter
+from drivers.logs.recording import RecordingWriter
 from drivers.serial.chunks import is_chunk
 from hil.scenario import Scenario
 from hil.source import FileSource
@@ -28,10 +28,8 @@ def decode_file(driver_name: str, path: Path) -> tuple[Iterator[str], Callable[[
     source = FileSource(path, paced=False)
 
     def lines() -> Iterator[str]:
-        batch = frames(256)
-        while n := source.receive(batch, 0.0):
-            good = batch[:n][batch["reserved"][:n, 0] != EVENT]
-            samples = driver.decode(good)
+        for batch in source.batches(256):
+            samples = driver.decode(batch)
             for k in range(len(samples)):
                 yield (
                     json.dumps({name: _plain(getattr(samples, name)[k]) for name in _FIELDS if hasattr(samples, name)})

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.can.aiding import AidingDecoder
-from drivers.can.frames import frames
-from drivers.logs.recording import EVENT
 from hil.calibration import MagnetometerTable
 from hil.calibration_sequence import SwingConfig
 from hil.source import FileSource
-from hil.tables import read_table
+from hil.tables import TABLES, read_table
 from nav.aiding import Kind
 from nav.errors import HilError
 from nav.increments import FloatArray
@@ -28,7 +26,6 @@ KNOWN = {
     "attitude": ("heading_deg", "pitch_deg", "roll_deg"),
 }
 """Further columns of the CSV by what is known of each reading; forces in m/s^2, or any other unit, at rest."""
-TABLES = {".csv", ".npz", ".parquet"}
 
 
 def fit(swing: SwingConfig, path: Path) -> MagnetometerTable:
@@ -69,10 +66,10 @@ def correct(table: MagnetometerTable, rows: NDArray[np.void]) -> None:
 
 def _recorded(path: Path, source: int) -> FloatArray:
     """Magnetic rows (n, 3) of a recording, T."""
-    file, decoder, batch = FileSource(path, paced=False), AidingDecoder(), frames(4096)
+    file, decoder = FileSource(path, paced=False), AidingDecoder()
     parts = [np.zeros((0, 3))]
-    while n := file.receive(batch, 0.0):
-        rows, _ = decoder.decode(batch[:n][batch["reserved"][:n, 0] != EVENT], None)
+    for batch in file.batches(4096):
+        rows, _ = decoder.decode(batch, None)
         parts.append(rows["value"][(rows["kind"] == Kind.MAGNETIC) & (rows["source"] == source), :3])
     if file.problem():
         raise HilError(file.problem())

@@ -16,7 +16,6 @@ from drivers.can.dtg_head_emulator import REPLAY, HeadEncoder
 from drivers.can.frames import FrameArray, frames
 from drivers.logs.dataflash import read_dataflash
 from drivers.logs.imu_log import ImuLog
-from drivers.logs.recording import RecordingReader
 from drivers.logs.ulog import read_ulog
 from hil.bridge import LoopOrder
 from hil.control import Control
@@ -24,7 +23,7 @@ from hil.geoid import undulation
 from hil.pacing import Pacer
 from hil.reference import Reference, interpolate_attitude
 from hil.scenario import Scenario, load, validated
-from hil.source import FileSource, is_own
+from hil.source import FileSource, is_own, scenario_table
 from hil.stats import Stats
 from nav.aiding import Kind
 from nav.alignment.analytic import magnetic_heading
@@ -74,9 +73,8 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         scenario = scenario.with_changes(bus=bus or f"unix:replay-{time.monotonic_ns():x}")
         return LoopOrder(scenario, paced=paced, reference=reference), True
     if suffix == ".dhil" or is_own(path):
-        reader = RecordingReader.open(path)
-        reader.close()
-        scenario = load(scenario_file) if scenario_file else _recorded_scenario(path, reader.header)
+        table = scenario_table(path)
+        scenario = load(scenario_file) if scenario_file else _recorded_scenario(path, table)
     elif suffix in {".log", ".blf", ".asc", ".trc", ".csv"}:
         scenario = load(scenario_file).with_changes(duration_s=None)
     else:
@@ -88,9 +86,8 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
     return LoopOrder(scenario, file=path, paced=paced), False
 
 
-def _recorded_scenario(path: Path, header: dict[str, Any]) -> Scenario:
-    table = header.get("scenario")
-    if not isinstance(table, dict):
+def _recorded_scenario(path: Path, table: dict[str, Any] | None) -> Scenario:
+    if table is None:
         raise HilError(f"recording {path}: its header holds no scenario; give one with --scenario")
     return validated(table, f"in recording {path}")
 

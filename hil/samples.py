@@ -8,19 +8,16 @@ from typing import Any
 import numpy as np
 
 from drivers import make_driver
-from drivers.can.frames import frames
-from drivers.logs.recording import EVENT, RecordingReader
 from hil.offline import IMU_HEADER
-from hil.source import FileSource, is_own
-from hil.tables import read_table
+from hil.source import FileSource, is_own, scenario_table
+from hil.tables import TABLES, read_table
 from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements
 from nav.instruments.allan import AllanFit, allan
+from nav.instruments.redundancy import GYRO_AXES
 
-HEAD_AXES = ("g1x", "g1y", "g2y", "g2z")
 _SPACE = ("x", "y", "z")
-TABLES = (".csv", ".npz", ".parquet")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,11 +66,7 @@ def read_samples(path: Path, driver_name: str | None = None) -> Samples:
         named = dict(zip(IMU_HEADER, table.T, strict=True))
         return Samples({"time_s": named.pop("time_s"), "step_s": step, **order, **named}, "")
     driver, source = make_driver(driver_name or _driver_of(path)), FileSource(path, paced=False)
-    batch, parts = frames(1024), []
-    while n := source.receive(batch, 0.0):
-        samples = driver.decode(batch[:n][batch["reserved"][:n, 0] != EVENT])
-        if len(samples):
-            parts.append(_columns(samples))
+    parts = [_columns(samples) for batch in source.batches(1024) if len(samples := driver.decode(batch))]
     if not parts:
         raise HilError(
             f"{path}: no samples of {driver_name or _driver_of(path)} in it: give the board's driver with --imu"
@@ -125,10 +118,7 @@ def coefficients(axis: str, fit: AllanFit) -> dict[str, float]:
 def _driver_of(path: Path) -> str:
     if not is_own(path):
         raise HilError(f"{path}: it does not say what board is in it: give the driver with --imu")
-    reader = RecordingReader.open(path)
-    reader.close()
-    scenario = reader.header.get("scenario")
-    return str(scenario.get("driver", "dtg-head")) if isinstance(scenario, dict) else "dtg-head"
+    return str((scenario_table(path) or {}).get("driver", "dtg-head"))
 
 
 def _columns(samples: HeadIncrements | ImuIncrements) -> dict[str, FloatArray]:
@@ -139,10 +129,10 @@ def _columns(samples: HeadIncrements | ImuIncrements) -> dict[str, FloatArray]:
         "validity": samples.validity,
     }
     head = isinstance(samples, HeadIncrements)
-    columns |= {f"dtheta_{axis}": samples.dtheta[:, i] for i, axis in enumerate(HEAD_AXES if head else _SPACE)}
+    columns |= {f"dtheta_{axis}": samples.dtheta[:, i] for i, axis in enumerate(GYRO_AXES if head else _SPACE)}
     columns |= {f"dvel_{axis}": samples.dvel[:, i] for i, axis in enumerate(_SPACE)}
     if isinstance(samples, HeadIncrements):
-        columns |= {f"rotor_{axis}": samples.rotor[:, i] for i, axis in enumerate(HEAD_AXES)}
+        columns |= {f"rotor_{axis}": samples.rotor[:, i] for i, axis in enumerate(GYRO_AXES)}
         columns |= {f"spin_g{i + 1}_hz": samples.spin[:, i] for i in range(2)}
         columns |= {f"temperature_{name}": samples.temperature[:, i] for i, name in enumerate(("g1", "g2", "a"))}
     return {name: np.array(values, float) for name, values in columns.items()}  # copies: they hold until the next batch

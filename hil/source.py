@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import can
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from drivers.can.bus import open_port
 from drivers.can.convert import from_message
 from drivers.can.frames import FrameArray, frames
-from drivers.logs.recording import MAGIC, RecordingReader
+from drivers.logs.recording import EVENT, MAGIC, RecordingReader
 from nav.errors import HilError
 
 
@@ -117,6 +117,13 @@ class FileSource:
         self._chunk = self._chunk[n:]
         return n
 
+    def batches(self, room: int) -> Iterator[FrameArray]:
+        """All frames, `room` at most at a time, without the events among them; each valid until the next."""
+        batch = frames(room)
+        while n := self.receive(batch, 0.0):
+            taken = batch[:n]
+            yield taken[taken["reserved"][:, 0] != EVENT]
+
     def _due(self, n: int, timeout: float) -> int:
         times = self._chunk["time_ns"][:n]
         now = time.monotonic_ns()
@@ -135,6 +142,20 @@ class FileSource:
     def problem(self) -> str:
         """Damage of the file."""
         return self._problem
+
+
+def scenario_table(path: Path) -> dict[str, Any] | None:
+    """The scenario in the header of our own recording `path`, as it stands there; None where there is none.
+
+    Raises
+    ------
+    HilError
+        The file cannot be read.
+    """
+    reader = RecordingReader.open(path)
+    reader.close()
+    table = reader.header.get("scenario")
+    return table if isinstance(table, dict) else None
 
 
 def is_own(path: Path) -> bool:

@@ -9,6 +9,9 @@ import numpy as np
 from nav.errors import HilError
 from nav.increments import FloatArray
 
+TABLES = (".csv", ".npz", ".parquet")
+"""Endings of such files."""
+
 
 def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
     """The columns `header` of a ``.csv``, ``.npz`` or ``.parquet`` file as (n, len(header)) floats.
