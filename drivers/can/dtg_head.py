@@ -16,6 +16,7 @@ from drivers.can.aiding import is_aiding
 from drivers.can.codec import MessageCodec, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
 from drivers.can.integrity import Protection, protection
+from drivers.can.samples import signed
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, IntArray, Validity
 from nav.kernel import kernel
@@ -57,11 +58,6 @@ def head_database_text() -> str:
 
 
 @kernel
-def _signed32(value: int) -> int:
-    return (value + 0x80000000) % 0x100000000 - 0x80000000
-
-
-@kernel
 def _track(
     values: FloatArray,
     good: NDArray[np.bool_],
@@ -84,8 +80,8 @@ def _track(
             outcome[_VERSION] += 1
             continue
         counter, us = int(values[k, _COUNTER]), int(values[k, _TIME])
-        delta = _signed32(counter - state[_LAST_COUNTER])
-        elapsed = _signed32(us - state[_LAST_US])
+        delta = signed(counter - state[_LAST_COUNTER], 32)
+        elapsed = signed(us - state[_LAST_US], 32)
         period = said[k, _PERIOD]
         if state[_STARTED] == 0:
             state[_STARTED] = 1

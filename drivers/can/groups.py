@@ -209,3 +209,26 @@ class Groups:
         imu, taken = self._samples.take(raw[:n])
         self.arrivals = arrival[rows[taken]]
         return imu
+
+
+class GroupedBoard:
+    """What drivers of such boards share; with a `decode` it satisfies `drivers.FrameDriver`."""
+
+    world_id = 0
+
+    def __init__(self, counters: Counters, groups: Groups) -> None:
+        self.counters, self._groups = counters, groups
+        self._identity: dict[str, object] = {}
+
+    @property
+    def period_s(self) -> float | None:
+        """Sample period, s, once learnt."""
+        return self._groups.period_s
+
+    def identity(self) -> dict[str, object]:
+        """Status and temperature, as last heard."""
+        return dict(self._identity)
+
+    def arrivals(self) -> IntArray:
+        """Arrival (ns) of the last frame of each sample of the last `decode`."""
+        return self._groups.arrivals

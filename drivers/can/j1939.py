@@ -19,15 +19,13 @@ from drivers import Counters
 from drivers.can.aiding import is_aiding
 from drivers.can.codec import Database, MessageCodec, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
-from drivers.can.samples import BAD, NUMBER, PUSH, PUSH_IS, RATE, RAW, TICKS, TURN, TURN_IS, Samples
+from drivers.can.samples import BAD, FLIP, NUMBER, PUSH, PUSH_IS, RATE, RAW, TICKS, TURN, TURN_IS, Samples
 from nav.errors import HilError
 from nav.increments import FloatArray, ImuIncrements, IntArray
 from nav.kernel import inline_kernel, kernel
 
 TICK_S = 1e-6
 GRID_S = 5e-3
-FLIP = np.array([1.0, -1.0, -1.0])
-"""Forward, left, up to forward, right, down, and back."""
 RATES = ("roll_rate", "pitch_rate", "yaw_rate")
 FORCES = ("longitudinal", "lateral", "vertical")
 HIGHEST = 0xFAFF

@@ -4,7 +4,8 @@ import numpy as np
 
 from drivers.can.emulation import EndRates, check_period, put, rounded, stamp
 from drivers.can.frames import FrameArray, frames
-from drivers.can.j1939 import FLIP, FORCES, RATES, j1939_database
+from drivers.can.j1939 import FORCES, RATES, j1939_database
+from drivers.can.samples import FLIP
 from nav.increments import FloatArray, ImuIncrements, IntArray
 
 ZERO = 32000

@@ -24,6 +24,8 @@ WINDOW = 64
 """How far back a sample counts as late or duplicate rather than as a restart."""
 LONGEST_S = 60.0
 """After a longer gap the board counts as started anew."""
+FLIP = np.array([1.0, -1.0, -1.0])
+"""Forward, left, up to forward, right, down, and back."""
 
 # Columns of a raw sample: ticks of the clock, counter (-1: none), whether the board flags it, rate or increment of the turn and
 # of the velocity, and which of these it is.

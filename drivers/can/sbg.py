@@ -14,9 +14,9 @@ import numpy as np
 from drivers import Counters
 from drivers.can.codec import Database, load_database
 from drivers.can.frames import FrameArray
-from drivers.can.groups import OPENING, PUSH_DELTA, PUSH_RATE, TURN_DELTA, TURN_RATE, Groups
+from drivers.can.groups import OPENING, PUSH_DELTA, PUSH_RATE, TURN_DELTA, TURN_RATE, GroupedBoard, Groups
 from drivers.can.samples import MEAN_RATE
-from nav.increments import ImuIncrements, IntArray
+from nav.increments import ImuIncrements
 
 TICK_S = 1e-6
 HEALTHY = 0x03FF
@@ -36,10 +36,8 @@ def sbg_database() -> Database:
     return load_database((files("fixtures") / "can" / "sbgCan.dbc").read_text("cp1252"))
 
 
-class Sbg:
+class Sbg(GroupedBoard):
     """See the module; satisfies `drivers.FrameDriver`."""
-
-    world_id = 0
 
     def __init__(self) -> None:
         database = sbg_database()
@@ -49,23 +47,9 @@ class Sbg:
             codec = database[f"SBG_ECAN_MSG_{name}"]
             kinds[codec] = kind
             self._columns[codec.name] = [codec.columns[f"{signal}_{axis}"] for axis in "XYZ"]
-        self.counters = Counters()
-        others = database.by_id.keys() - {codec.can_id for codec in kinds}
-        self._groups = Groups(kinds, TICK_S, self.counters, turn_delta=True, delta_is=MEAN_RATE, others=others)
-        self._identity: dict[str, object] = {}
-
-    @property
-    def period_s(self) -> float | None:
-        """Sample period, s, once learnt."""
-        return self._groups.period_s
-
-    def identity(self) -> dict[str, object]:
-        """Status bits and temperature, as last heard."""
-        return dict(self._identity)
-
-    def arrivals(self) -> IntArray:
-        """Arrival (ns) of the last frame of each sample of the last `decode`."""
-        return self._groups.arrivals
+        counters, others = Counters(), database.by_id.keys() - {codec.can_id for codec in kinds}
+        groups = Groups(kinds, TICK_S, counters, turn_delta=True, delta_is=MEAN_RATE, others=others)
+        super().__init__(counters, groups)
 
     def decode(self, batch: FrameArray) -> ImuIncrements:
         """The samples that `batch` completes, in order; valid until the next call."""

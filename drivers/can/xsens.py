@@ -24,16 +24,15 @@ from drivers.can.groups import (
     STATUS,
     TURN_DELTA,
     TURN_RATE,
+    GroupedBoard,
     Groups,
 )
-from drivers.can.samples import INCREMENT
-from nav.increments import FloatArray, ImuIncrements, IntArray
+from drivers.can.samples import FLIP, INCREMENT
+from nav.increments import FloatArray, ImuIncrements
 
 TICK_S = 1e-4
 SELF_TEST, CLIPPED = 0x0001, 0x3F00
 """Bits of the status word: self-test passed; an accelerometer or gyro is at the end of its range."""
-FLIP = np.array([1.0, -1.0, -1.0])
-"""Forward, left, up to forward, right, down, and back."""
 MOST_EXPONENT = 30
 """A DeltaV with a larger one is damaged."""
 KINDS = {
@@ -62,30 +61,14 @@ def rotation_vector(q: FloatArray) -> FloatArray:
     return vector
 
 
-class Xsens:
+class Xsens(GroupedBoard):
     """See the module; satisfies `drivers.FrameDriver`."""
-
-    world_id = 0
 
     def __init__(self) -> None:
         database = xsens_database()
         kinds = {database[name]: kind for name, kind in KINDS.items()}
-        self.counters = Counters()
-        self._groups = Groups(kinds, TICK_S, self.counters, turn_delta=False, delta_is=INCREMENT)
-        self._identity: dict[str, object] = {}
-
-    @property
-    def period_s(self) -> float | None:
-        """Sample period, s, once learnt."""
-        return self._groups.period_s
-
-    def identity(self) -> dict[str, object]:
-        """Status word and temperature, as last heard."""
-        return dict(self._identity)
-
-    def arrivals(self) -> IntArray:
-        """Arrival (ns) of the last frame of each sample of the last `decode`."""
-        return self._groups.arrivals
+        counters = Counters()
+        super().__init__(counters, Groups(kinds, TICK_S, counters, turn_delta=False, delta_is=INCREMENT))
 
     def decode(self, batch: FrameArray) -> ImuIncrements:
         """The samples that `batch` completes, in order; valid until the next call."""

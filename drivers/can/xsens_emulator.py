@@ -7,7 +7,8 @@ import numpy as np
 
 from drivers.can.emulation import EndRates, axes, check_period, put, rounded, stamp, ticks_of
 from drivers.can.frames import FrameArray, frames
-from drivers.can.xsens import FLIP, SELF_TEST, TICK_S, xsens_database
+from drivers.can.samples import FLIP
+from drivers.can.xsens import SELF_TEST, TICK_S, xsens_database
 from nav.increments import FloatArray, ImuIncrements, IntArray
 
 FULL_SCALE = 100.0
