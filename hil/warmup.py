@@ -83,7 +83,10 @@ def warm_loop(scenario: Scenario, report: Report) -> None:
     chunks = list(SimulatedHead(small).chunks(300))
     report(2)
     outlets = Outlets.make(recording=False, readers=1)
-    for chosen in (small, small.with_changes(navigation={"alignment": "moving"})):
+    ways = [small]
+    if scenario.navigation.alignment in ("swaying", "moving"):  # both by optimisation
+        ways.append(small.with_changes(navigation={"alignment": "moving"}))
+    for chosen in ways:
         loop = Loop(LoopOrder(chosen), outlets)
         for _, slow, batch in chunks:
             if len(slow):
