@@ -8,8 +8,8 @@ from unittest import mock
 from hil import cli
 
 
-def hil(*arguments: object, code: int = 0) -> tuple[str, str]:
-    """``hil ARGUMENT...``: standard output and standard error; `code` is the exit code that must come."""
+def called(*arguments: object) -> tuple[int, str, str]:
+    """``hil ARGUMENT...``: exit code, standard output, standard error."""
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     out, err, ended = io.StringIO(), io.StringIO(), 0
     with (
@@ -23,5 +23,11 @@ def hil(*arguments: object, code: int = 0) -> tuple[str, str]:
             ended = int(end.code or 0)
     for number, handler in handlers.items():
         signal.signal(number, handler)
-    assert ended == code, err.getvalue()
-    return out.getvalue(), err.getvalue()
+    return ended, out.getvalue(), err.getvalue()
+
+
+def hil(*arguments: object, code: int = 0) -> tuple[str, str]:
+    """``hil ARGUMENT...``: standard output and standard error; `code` is the exit code that must come."""
+    ended, out, err = called(*arguments)
+    assert ended == code, err
+    return out, err

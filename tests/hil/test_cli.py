@@ -6,17 +6,17 @@ import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from commands import called
 
 from drivers.can.convert import to_message
 from drivers.can.dtg_head_emulator import HeadEncoder
 from drivers.can.frames import FrameArray
-from hil import cli
 
 Cli = Callable[..., tuple[int, str, str]]
 HIL = (sys.executable, "-c", "from hil.cli import main; main()")
@@ -36,24 +36,9 @@ COMMANDS = (
 
 
 @pytest.fixture
-def hil(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Cli]:
+def hil() -> Cli:
     """``hil ARGUMENT...`` in this process: (exit code, standard output, standard error)."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["hil", *map(str, arguments)])
-        capsys.readouterr()
-        code = 0
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    yield call
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+    return called
 
 
 def a_head(samples: int) -> FrameArray:

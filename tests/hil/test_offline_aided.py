@@ -3,15 +3,14 @@
 import csv
 import json
 import math
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import called
 
-from hil import cli
 from hil.aid_file import AID_HEADER, read_aiding
 from hil.geometry import position_error
 from hil.magnetic import magnetic_field
@@ -89,17 +88,8 @@ def write(folder, lines, header=AID_HEADER, init=INIT):
 
 
 @pytest.fixture
-def hil(monkeypatch, capsys):
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["hil", *map(str, arguments)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
+def hil():
+    return called
 
 
 def navigate(hil, folder, *options):
