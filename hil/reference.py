@@ -90,12 +90,7 @@ class Reference:
         if not self.chosen(times).any():
             return None
         _, *parts = self.errors(times, attitudes)
-        result = {}
-        for name, values in zip(("total_deg", "tilt_deg", "heading_deg"), parts, strict=True):
-            spread = Spread()
-            spread.add(values)
-            result[name] = spread.as_dict(180.0 / np.pi)
-        return result
+        return _spreads(dict(zip(("total_deg", "tilt_deg", "heading_deg"), parts, strict=True)), 180.0 / np.pi)
 
     def _compare_track(self, times: FloatArray, places: FloatArray) -> dict[str, Any]:
         at = self.fixes["time"]
@@ -110,12 +105,7 @@ class Reference:
         if known.any():
             expected = np.hypot(np.stack(sigma, axis=1), fixes["sigma"][:, :3])
             parts["position_sigma"] = (error / expected)[known].ravel()
-        result = {}
-        for name, values in parts.items():
-            spread = Spread()
-            spread.add(np.ascontiguousarray(values))
-            result[name] = spread.as_dict()
-        return result
+        return _spreads(parts)
 
     def _plain(self) -> tuple[FloatArray, FloatArray]:
         """Attitude by plain integration of the raw rates from the reference's first attitude."""
@@ -130,6 +120,15 @@ class Reference:
                 normalise(q)
             attitudes[k] = q
         return times, attitudes
+
+
+def _spreads(parts: dict[str, FloatArray], scale: float = 1.0) -> dict[str, Any]:
+    result = {}
+    for name, values in parts.items():
+        spread = Spread()
+        spread.add(np.ascontiguousarray(values))
+        result[name] = spread.as_dict(scale)
+    return result
 
 
 def interpolate_attitude(times: FloatArray, q: FloatArray, at: FloatArray) -> FloatArray:
