@@ -54,6 +54,8 @@ class Taps:
         Takes alignment requests to the loop; brings the loss of samples.
     aiding : Ring, optional
         Of `FRAME`: takes measurements from the network to the loop.
+    early : bool
+        They serve the alignment as well.
     """
 
     states: Ring
@@ -61,6 +63,7 @@ class Taps:
     events: Ring
     control: Control
     aiding: Ring | None = None
+    early: bool = False
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -84,7 +87,7 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
     with ExitStack() as stack:
         try:
             identity = Identity(config.system_id, config.component_id, config.vehicle)
-            intake = _intake(config, taps.aiding)
+            intake = _intake(config, taps)
             order = partial(_obey, control=taps.control)
             station = Station(identity, config.rates_hz, undulation, order, intake)
             endpoints = []
@@ -216,8 +219,9 @@ class _Publisher:
         return {"p50": float(p50), "p99": float(p99), "p999": float(p999), "max": float(ages_us.max())}
 
 
-def _intake(config: MavlinkConfig, ring: Ring | None) -> Intake | None:
-    """What is taken from the network, as frames of a sender of its own into `ring`."""
+def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
+    """What is taken from the network, as frames of a sender of its own to the loop."""
+    ring = taps.aiding
     if ring is None or not config.aiding:
         return None
     from drivers.can.aiding import AidingEncoder
@@ -229,7 +233,7 @@ def _intake(config: MavlinkConfig, ring: Ring | None) -> Intake | None:
         batch["time_ns"] = time.time_ns()
         ring.push(batch)
 
-    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay)
+    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, early=taps.early)
 
 
 def _obey(command: str, control: Control) -> None:

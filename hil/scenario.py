@@ -336,6 +336,12 @@ class NavigationConfig(_Model):
     track_bias_at_rest: bool = False
     """Keep averaging the gyro bias while the vehicle stands (boards that cannot gyrocompass)."""
 
+    @property
+    def aligned_by_aiding(self) -> bool:
+        """The alignment uses measurements besides the inertial ones."""
+        no_heading = self.alignment == "level" and self.start.heading_deg is None
+        return no_heading or self.alignment in ("moving", "transfer")
+
     @model_validator(mode="after")
     def _consistent(self) -> "NavigationConfig":
         if self.assume != AssumeConfig(smooth_ms=self.assume.smooth_ms) and not self.aided:

@@ -139,7 +139,8 @@ class Session:
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
             live = self.order.paced and self.order.file is None
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control, outlets.aiding if live else None)
+            network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:

@@ -44,6 +44,8 @@ class Intake:
         Age of a measurement when it comes, s.
     take : callable
         Takes the rows of `AIDING` on; a HilError of it refuses them.
+    early : bool
+        The alignment uses measurements: take them while it goes on. Else they are refused until the navigation has begun.
     """
 
     def __init__(
@@ -52,7 +54,10 @@ class Intake:
         master: tuple[int, int] | None,
         delay_s: float,
         take: Callable[[NDArray[Any]], None],
+        *,
+        early: bool = False,
     ) -> None:
+        self._first = Mode.ALIGN if early else Mode.NAVIGATE
         self._senders, self._master, self._delay_s, self._take = frozenset(senders), master, delay_s, take
         self._last_s: dict[tuple[str, int, int], float] = {}
         self.taken: Counter[str] = Counter()
@@ -100,7 +105,7 @@ class Intake:
             if station.now_s - self._last_s.get(key, -SHORTEST_S) < SHORTEST_S:
                 raise Refused("too often")
             self._last_s[key] = station.now_s
-            if station.solution.mode < Mode.NAVIGATE or station.solution.health & Health.SILENT:
+            if station.solution.mode < self._first or station.solution.health & Health.SILENT:
                 raise Refused("not navigating")
             self._take(np.array(decode(1e-9 * station.device_ns() - self._delay_s)))
         except Refused as refusal:

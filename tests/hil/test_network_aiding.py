@@ -11,12 +11,15 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from drivers.can.aiding import AidingDecoder, AidingEncoder
 from drivers.can.frames import FrameArray
 from hil.bridge import LoopOrder
+from hil.geoid import undulation
 from hil.pytest_plugin import StartBridge
 from hil.scenario import Scenario
 from hil.session import Session
 from nav.aiding import RELAYED, Kind, aiding_rows
 from nav.earth import curvature_radii
 from nav.errors import HilError
+from nav.rotation import euler_from_quaternion
+from nav.state import Mode
 
 LAT_DEG, LON_DEG, HEIGHT_M = 50.0, 36.25, 150.0
 NORTH_M = 8.0
@@ -83,6 +86,40 @@ def test_the_position_follows_and_the_recording_replays(hil_bridge: StartBridge,
     assert again["navigation_digest"] == summary["navigation_digest"]
     assert again["aiding"] == summary["aiding"]
     assert again["samples"] == summary["samples"]
+
+
+def test_the_alignment_is_transferred_from_another_inertial_system(hil_bridge: StartBridge, tmp_path: Path) -> None:
+    """ATTITUDE_QUATERNION and GLOBAL_POSITION_INT of system 2 begin the navigation, live and in the replay."""
+    file, heading = tmp_path / "transfer.dhil", math.radians(30.0)
+    scenario = SCENARIO.with_changes(
+        motion={"heading": {"offset": 30.0}},
+        navigation={"alignment": "transfer", "start": {"latitude_deg": 0.0, "longitude_deg": 0.0, "height_m": 0.0}},
+        mavlink={"master": (2, 1)},
+    )
+    bridge = hil_bridge(scenario, record=file)
+    client = mavutil.mavlink_connection(
+        f"udpin:127.0.0.1:{bridge.mavlink_port}", source_system=2, source_component=1, dialect="ardupilotmega"
+    )
+    assert client.recv_match(type="HEARTBEAT", blocking=True, timeout=30.0) is not None
+    sea_m = HEIGHT_M - undulation(math.radians(LAT_DEG), math.radians(LON_DEG))
+    place = round(1e7 * LAT_DEG), round(1e7 * LON_DEG), round(1e3 * sea_m)
+    deadline = time.monotonic() + 60.0
+    while (state := bridge.state()) is None or state["mode"] != Mode.NAVIGATE:
+        assert time.monotonic() < deadline
+        client.mav.attitude_quaternion_send(0, math.cos(heading / 2), 0.0, 0.0, math.sin(heading / 2), 0.0, 0.0, 0.0)
+        client.mav.global_position_int_send(0, *place, 0, 0, 0, 0, 3000)
+        time.sleep(0.2)
+    client.close()
+    summary = bridge.stop()
+    assert north_m(float(state["lat"])) == pytest.approx(0.0, abs=1.0)
+    assert state["height"] == pytest.approx(HEIGHT_M, abs=1.0)
+    assert euler_from_quaternion(state["q_nb"]) == pytest.approx([heading, 0.0, 0.0], abs=1e-3)
+    assert summary["aiding"].keys() == {"GNSS", "ATTITUDE"}
+    with Session(LoopOrder(scenario, file=file, paced=False), publish=False) as session:
+        session.wait_ready()
+        while session.running:
+            time.sleep(0.05)
+    assert session.summary()["navigation_digest"] == summary["navigation_digest"]
 
 
 def test_nobody_steers_the_navigator_unasked(hil_bridge: StartBridge) -> None:

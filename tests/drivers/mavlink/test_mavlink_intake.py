@@ -20,10 +20,10 @@ DEVICE_S = 50.0
 class Net:
     """A station that takes measurements of system 255 and follows 2/1; what it takes is kept."""
 
-    def __init__(self, mode: Mode = Mode.NAVIGATE, health: Health = Health.GOOD) -> None:
+    def __init__(self, mode: Mode = Mode.NAVIGATE, health: Health = Health.GOOD, *, early: bool = False) -> None:
         self.rows: list[Any] = []
         self.encoder = AidingEncoder()
-        self.intake = Intake((255,), (2, 1), DELAY_S, self.take)
+        self.intake = Intake((255,), (2, 1), DELAY_S, self.take, early=early)
         self.station = Station(Identity(), {}, lambda lat, lon: 20.0, print, self.intake)
         row = np.zeros(1, NAV_STATE)
         row["time"], row["mode"], row["health"], row["q_nb"] = DEVICE_S, mode, health, (1.0, 0.0, 0.0, 0.0)
@@ -94,6 +94,16 @@ def test_nothing_is_taken_while_it_could_not_be_used(mode: Mode, health: Health)
     net.hear(gps())
     assert net.rows == []
     assert net.intake.refused == {"not navigating": 1}
+
+
+def test_an_alignment_that_uses_measurements_gets_them() -> None:
+    net = Net(Mode.ALIGN, early=True)
+    net.hear(gps())
+    assert [row["kind"] for row in net.rows] == [Kind.GNSS]
+    for mode, health in ((Mode.INIT, Health.GOOD), (Mode.ALIGN, Health.SILENT)):
+        net = Net(mode, health, early=True)
+        net.hear(gps())
+        assert (net.rows, net.intake.refused) == ([], {"not navigating": 1})
 
 
 def test_a_bad_message_is_counted_by_its_reason() -> None:
