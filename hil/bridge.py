@@ -35,7 +35,7 @@ from hil.ring import Ring
 from hil.scenario import Scenario
 from hil.settings import settings_of
 from hil.source import BusSource, FileSource, Source
-from hil.stats import Phase, Stats
+from hil.stats import Phase, Stats, Times
 from hil.warmup import warm_loop
 from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
@@ -162,7 +162,7 @@ class Loop:
     def _between(self, batch: FrameArray) -> bool:
         """Take frames, the measurements among them in their place between the samples."""
         aided = is_aiding(batch["can_id"])
-        if not aided.any():
+        if np.count_nonzero(aided) == 0:
             return len(batch) > 0 and self._take(batch)
         rows, places = self._aiding.decode(batch, self._now)
         if self._magnetometer is not None:
@@ -223,13 +223,15 @@ class Loop:
             return
         imu = self._combine(raw) if isinstance(raw, HeadIncrements) else self._turned(raw)
         rows = self.navigator.process(imu)
-        rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
-        self._arrival_ns = int(arrivals[-1])
+        self._arrival_ns = arrival = int(arrivals[-1])
+        rows["arrival_ns"] = arrival if len(rows) != len(arrivals) else arrivals
         self._publish(rows)
         stats = self._outlets.stats
         if self._live:
-            stats.add_latencies(time.time_ns() - arrivals)
-            stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
+            stats.count_since(Times.LATENCY, time.time_ns(), arrivals)
+            age_s = self._clock.update(float(imu.time[-1]), arrival)
+            stats.count(Times.AGE, round(1e9 * age_s))
+            stats["age_us"] = round(1e6 * age_s)
         if len(rows) != len(imu):
             stats["interpolated"] += len(rows) - len(imu)
 

@@ -23,7 +23,7 @@ from hil.control import run_part
 from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
-from hil.stats import Phase
+from hil.stats import Phase, Times
 from hil.warmup import STEPS
 from hil.world.head import run_head
 from nav.errors import HilError
@@ -284,7 +284,7 @@ class Session:
         result["rate_hz"] = stats["samples"] / device_s if device_s > 0 else 0.0
         result["wall_s"], result["device_s"] = wall, device_s
         result["speed"] = device_s / wall if wall else 0.0
-        result["latency_us"] = stats.latency_us()
+        result["latency_us"] = stats.quantiles_us(Times.LATENCY)
         for name in ("loop", "feeder", "publisher", "recorder"):
             part = self._parts.get(name)
             if part is not None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drivers import Counters
 from drivers.can.aiding import is_aiding
 from drivers.can.codec import MessageCodec, load_database
-from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
+from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray, as_bytes
 from drivers.can.integrity import Protection, protection
 from drivers.can.samples import signed
 from nav.errors import HilError
@@ -29,7 +29,7 @@ ROTOR_VALID = 0x8000
 """Status bit: the rotor angles are there."""
 # What the slow frames have said, a row for each frame: sample period (us), status bits of the built-in test, rotor speeds (Hz),
 # temperatures (degrees Celsius).
-_PERIOD, _BIT, _SPIN, _TEMPERATURE, _SAID = 0, 1, slice(2, 4), slice(4, 7), 7
+_PERIOD, _BIT, _SPIN, _TEMPERATURE, _SAID = 0, 1, 2, 4, 7
 _BUILT_IN = ("bit_g1", "bit_g2", "bit_ax", "bit_ay", "bit_az")
 """Signals of HEAD_BIT, in the order of the status bits that say the same."""
 WINDOW = 64
@@ -121,6 +121,62 @@ def _track(
 
 
 @kernel
+def _fill(
+    count: int,
+    rows: IntArray,
+    values: FloatArray,
+    said: FloatArray,
+    times: IntArray,
+    dtheta: FloatArray,
+    rotor: FloatArray,
+    dvel: FloatArray,
+    validity: IntArray,
+    status: IntArray,
+    spin: FloatArray,
+    temperature: FloatArray,
+    arrivals: IntArray,
+) -> None:
+    """What the accepted samples hold, and what the slow frames had said when they came."""
+    for n in range(count):
+        k = rows[n]
+        there = (int(values[k, _STATUS]) & ROTOR_VALID) != 0
+        for i in range(4):
+            dtheta[n, i] = values[k, _DTHETA + i]
+            rotor[n, i] = values[k, _ROTOR + i] if there else np.nan
+        for i in range(3):
+            dvel[n, i] = values[k, _DVEL + i]
+            temperature[n, i] = said[k, _TEMPERATURE + i]
+        spin[n, 0], spin[n, 1] = said[k, _SPIN], said[k, _SPIN + 1]
+        status[n] = int(values[k, _STATUS]) | int(said[k, _BIT])
+        if said[k, _BIT] != 0.0:
+            validity[n] |= Validity.SENSOR.value
+        arrivals[n] = times[k]
+
+
+@kernel
+def _are_samples(
+    frames: NDArray[np.uint8], can_id: int, now: FloatArray, data: NDArray[np.uint8], said: FloatArray
+) -> bool:
+    """Whether all `frames` (n, 80) are FD samples; then their payloads and what was said lie in `data` and `said`."""
+    for k in range(frames.shape[0]):
+        found = frames[k, 8] | frames[k, 9] << 8 | frames[k, 10] << 16 | frames[k, 11] << 24
+        if found != can_id or frames[k, 12] != 64 or frames[k, 13] & FDF == 0:
+            return False
+        for i in range(64):
+            data[k, i] = frames[k, 16 + i]
+        for i in range(_SAID):
+            said[k, i] = now[i]
+    return True
+
+
+@kernel
+def _reorder(raw: FloatArray, columns: IntArray, values: FloatArray) -> None:
+    for k in range(raw.shape[0]):
+        for i in range(columns.shape[0]):
+            values[k, i] = raw[k, columns[i]]
+
+
+@kernel
 def _join(
     kind: IntArray,
     data: NDArray[np.uint8],
@@ -194,7 +250,8 @@ class DtgHead:
         self._raw = np.zeros((n, len(self._sample.signals)))
         self._values = np.zeros((n, _COLUMNS))
         self._good = np.zeros(n, np.bool_)
-        self._rows = np.zeros(n, np.int64)
+        self._rows, self._times = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._views: dict[int, HeadIncrements] = {}
         self._said = np.zeros((n, _SAID))
 
     def identity(self) -> dict[str, object]:
@@ -211,13 +268,12 @@ class DtgHead:
         if n > len(self._batch):
             self._room(2 * n)
         self.counters.frames += n
+        said = self._said[:n]
+        if _are_samples(as_bytes(batch), self._sample.can_id, self._now, self._data, said):
+            return self._samples(n, batch["time_ns"], said)
         ids = batch["can_id"]
         is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
-        said = self._said[:n]
         said[:] = self._now
-        if is_sample.all():
-            self._data[:n] = batch["data"]
-            return self._samples(n, batch["time_ns"], said)
         self._others(batch, np.flatnonzero(~(is_sample | is_aiding(ids))), said)
         chosen = batch[is_sample]
         if len(chosen):
@@ -229,37 +285,19 @@ class DtgHead:
         data = self._data[:n]
         self._protection["HEAD_SAMPLE"].check(data, self._good[:n])
         self._sample.decode(data, self._raw[:n])
-        self._values[:n] = self._raw[:n, self._columns]
+        _reorder(self._raw[:n], self._columns, self._values)
         return self._accept(n, times, said)
 
     def _accept(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
         batch, values = self._batch, self._values[:n]
-        count = _track(
-            values,
-            self._good[:n],
-            said,
-            self._state,
-            self._outcome,
-            batch.time,
-            batch.step,
-            batch.sequence,
-            batch.validity,
-            self._rows,
-        )
-        rows = self._rows[:count]
-        result = batch.rows(0, count)
-        kept = values[rows]
-        result.dtheta[:] = kept[:, _DTHETA : _DTHETA + 4]
-        result.rotor[:] = kept[:, _ROTOR : _ROTOR + 4]
-        result.dvel[:] = kept[:, _DVEL : _DVEL + 3]
-        invalid = (kept[:, _STATUS].astype(np.int64) & ROTOR_VALID) == 0
-        if invalid.any():
-            result.rotor[invalid] = np.nan
-        said = said[rows]
-        result.spin[:], result.temperature[:] = said[:, _SPIN], said[:, _TEMPERATURE]
-        result.status[:] = kept[:, _STATUS].astype(np.int64) | said[:, _BIT].astype(np.int64)
-        result.validity[said[:, _BIT] != 0.0] |= Validity.SENSOR.value
-        self._arrivals = times[rows]
+        samples = batch.time, batch.step, batch.sequence, batch.validity
+        count = _track(values, self._good[:n], said, self._state, self._outcome, *samples, self._rows)
+        sensed = batch.dtheta, batch.rotor, batch.dvel, batch.validity, batch.status, batch.spin, batch.temperature
+        _fill(count, self._rows, values, said, times, *sensed, self._times)
+        result = self._views.get(count)
+        if result is None:
+            result = self._views[count] = batch.rows(0, count)
+        self._arrivals = self._times[:count]
         counters, outcome = self.counters, self._outcome
         counters.samples, counters.lost, counters.late = (
             int(outcome[_SAMPLES]),
@@ -307,9 +345,9 @@ class DtgHead:
         if codec.name == "HEAD_BIT":
             self._now[_BIT] = sum(1 << k for k, name in enumerate(_BUILT_IN) if said[name])
         if codec.name == "HEAD_ROTOR":
-            self._now[_SPIN] = said["rotor_speed_g1"], said["rotor_speed_g2"]
+            self._now[_SPIN : _SPIN + 2] = said["rotor_speed_g1"], said["rotor_speed_g2"]
         if codec.name == "HEAD_TEMPERATURE":
-            self._now[_TEMPERATURE] = [said[f"temperature_{part}"] for part in ("g1", "g2", "acc")]
+            self._now[_TEMPERATURE:] = [said[f"temperature_{part}"] for part in ("g1", "g2", "acc")]
         self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
 
     def _classic_samples(self, batch: FrameArray, said: FloatArray) -> HeadIncrements:
