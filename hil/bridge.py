@@ -30,6 +30,7 @@ from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
 from hil.control import Control
 from hil.magnetometer import correct
+from hil.realtime import claim
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
@@ -75,6 +76,8 @@ class LoopOrder:
         Give our attitudes back with the result (``trace``: times, attitudes).
     own_world : bool
         The samples are of the scenario's own world, also where the board cannot say so.
+    realtime : bool
+        Claim priority, locked memory and a processor (:mod:`hil.realtime`).
     """
 
     scenario: Scenario
@@ -83,6 +86,7 @@ class LoopOrder:
     reference: Reference | None = None
     keep_trace: bool = False
     own_world: bool = False
+    realtime: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +126,8 @@ class Loop:
         self.navigator = Navigator(settings_of(scenario), recorder)
         self.finished = False
         """The scenario's duration is over."""
+        self.samples = 0
+        """Navigated so far."""
         self._aiding = AidingDecoder()
         self._now: float | None = None
         """Device time of the newest sample."""
@@ -146,7 +152,6 @@ class Loop:
         self._arrival_ns = 0
         self._started: float | None = None
         self._covered = 0.0
-        self._samples = 0
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
@@ -214,7 +219,7 @@ class Loop:
         if self.finished:
             return
         raw = self._cut(raw)
-        self._samples += len(raw)
+        self.samples += len(raw)
         if len(raw) == 0:
             return
         if self._truth is None and self.driver.world_id == self._world:
@@ -329,8 +334,8 @@ class Loop:
     def _count(self) -> None:
         counters = self.driver.counters
         self._outlets.stats.set_block("frames", counters.as_list())
-        self._outlets.stats["samples"] = self._samples  # not those of the last batch that lie beyond the duration
-        self._outlets.control.set_loss(counters.lost, self._samples)
+        self._outlets.stats["samples"] = self.samples  # not those of the last batch that lie beyond the duration
+        self._outlets.control.set_loss(counters.lost, self.samples)
 
     def result(self) -> dict[str, Any]:
         """What the summary needs beyond the shared counters."""
@@ -349,7 +354,7 @@ class Loop:
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
-        if self._samples and (sigma := _totals(self._last()["sigma"].astype(float))) is not None:
+        if self.samples and (sigma := _totals(self._last()["sigma"].astype(float))) is not None:
             result["estimate"] = {"sigma": sigma, "ratio": self._truth.ratios() if self._truth is not None else {}}
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
@@ -387,11 +392,18 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         try:
             gc.collect()
             gc.freeze()
+            granted = claim() if order.realtime else None
+            for lack in granted.lacking if granted else ():
+                loop.navigator.tell(0.0, "warning", lack)
+            outlets.control.loop_begins()
             stats["phase"] = Phase.READY
             _run(loop, source, order, outlets)
         finally:
+            outlets.control.loop_ends()
             source.close()
         result = loop.result()
+        if granted:
+            result["realtime"] = granted.as_dict()
         if source.problem():
             result["problem"] = source.problem()
         stats["phase"] = Phase.DONE
@@ -415,7 +427,9 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
         now = time.monotonic_ns()
         stats["beat_ns"] = now
         if n:
-            taken = batch[:n]
+            taken, samples = batch[:n], loop.samples
+            if source.live:
+                stats.count(Times.WAKE, time.time_ns() - int(taken["time_ns"][n - 1]))
             _record(taken, outlets, order.paced)
             if order.file is not None and taken["reserved"][:, 0].any():
                 got = take_with_events(loop, taken)
@@ -424,6 +438,11 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             if got:
                 heard = now
                 stats["phase"] = Phase.RUNNING
+            if source.live:
+                took = time.monotonic_ns() - now
+                stats.count(Times.ROUND, took)
+                if got and took > 1e9 * (loop.samples - samples) * (loop.driver.period_s or math.inf):
+                    stats["overruns"] += 1
         if outlets.aiding.count > relayed_number:
             copied, first = outlets.aiding.pull(relayed, relayed_number)
             relayed_number = first + copied

@@ -38,6 +38,9 @@ Links = Annotated[
     typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
+Realtime = Annotated[
+    bool, typer.Option("--realtime", help="Priority, locked memory and a processor for the loop, where permitted.")
+]
 Asserts = Annotated[
     list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
 ]
@@ -55,6 +58,7 @@ def run(
     speed: Speed = "1",
     seed: Seed = None,
     record: Record = None,
+    realtime: Realtime = False,
     assertion: Asserts = None,
     junit: Junit = None,
     no_dashboard: Annotated[
@@ -86,6 +90,7 @@ def run(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
         own_world=not outside,
+        realtime=realtime,
     )
     _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
 
@@ -97,9 +102,11 @@ def imu(
     duration: Duration = None,
     speed: Speed = "1",
     seed: Seed = None,
+    realtime: Realtime = False,
     as_json: Json = False,
 ) -> None:
     """Run the simulated sensor head alone, for a bridge in another process or on another machine."""
+    from hil.realtime import claim
     from hil.scenario import load
     from hil.world.head import SimulatedHead, feed
 
@@ -107,6 +114,8 @@ def imu(
     chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
     stop = _StopSignal()
     head = SimulatedHead(chosen)
+    for lack in claim().lacking if realtime else ():
+        _say(lack)
     _say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
     result = feed(head, chosen, paced=_paced(speed), cancelled=lambda: stop.wanted)
     _report({"scenario": chosen.name, **result}, as_json=as_json)
@@ -120,6 +129,7 @@ def replay(
     mavlink: Links = None,
     speed: Speed = "1",
     record: Record = None,
+    realtime: Realtime = False,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
     withhold: Annotated[
         list[str] | None,
@@ -138,7 +148,8 @@ def replay(
     from hil.player import plan_replay, run_player
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
-    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold)))
+    changed = order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold))
+    order = replace(order, scenario=changed, realtime=realtime)
     if plot is not None:
         if order.reference is None:
             raise HilError(f"--plot: {log} carries no attitude to compare with")
@@ -514,7 +525,7 @@ def _follow(session: "Session", stop: "_StopSignal", view: Any) -> None:
         if stop.wanted:
             session.stop()
         view.refresh(time.monotonic())
-        time.sleep(0.1)
+        session.wait(0.1)
 
 
 class _StopSignal:

@@ -3,7 +3,6 @@
 import importlib.util
 import os
 import platform
-import resource
 import shutil
 import socket
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from drivers import driver_names
+from hil.realtime import refused
 from nav.errors import HilError
 
 ARPHRD_CAN = "280"
@@ -93,17 +93,15 @@ def _can() -> Iterator[Finding]:
 
 
 def _real_time() -> Iterator[Finding]:
-    soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    good = os.geteuid() == 0 or hard > 0
-    yield Finding(
-        "real-time priority",
-        "ok" if good else "lack",
-        f"rtprio limit {soft}..{hard}{', root' if os.geteuid() == 0 else ''}",
-        "" if good else "add '@realtime - rtprio 90' to /etc/security/limits.d and join that group",
+    lacking = refused()
+    found = (
+        "; ".join(lack.partition(":")[0] for lack in lacking) or "priority, locked memory and a processor are granted"
     )
-    memlock = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
-    text = "unlimited" if memlock == resource.RLIM_INFINITY else f"{memlock >> 20} MiB"
-    yield Finding("locked memory", "info", text)
+    mend = "" if not lacking else lacking[0].partition(": ")[2]
+    yield Finding("hil run --realtime", "lack" if lacking else "ok", found, mend)
+    kernel = Path("/sys/kernel/realtime")
+    text = "PREEMPT_RT" if kernel.is_file() and kernel.read_text().strip() == "1" else "not PREEMPT_RT"
+    yield Finding("kernel", "info", f"{platform.release()}, {text}")
     clock = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     source = clock.read_text().strip() if clock.is_file() else "unknown"
     slow = source in {"hpet", "acpi_pm", "jiffies"}

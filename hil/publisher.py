@@ -5,6 +5,7 @@ goes out has just been computed. The loop that computes never waits for it.
 """
 
 import math
+import os
 import selectors
 import signal
 import time
@@ -36,6 +37,7 @@ _READ_S = 0.1
 """A solution is read at least this often, for the status."""
 _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
+LOOP_DIED = "the navigation loop died: no solutions any more"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +81,7 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
         Ends the publisher.
     report : Connection
         Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
-        same for each URL), ``latency_us`` (arrival of the sample to the end of sending, `None` without one) and, where
+        same for each URL), ``latency_us`` (arrival of the sample to its ATTITUDE on a link, `None` without one) and, where
         measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
         ``failed``, a text, when a link could not be opened or the configuration is wrong.
     """
@@ -111,6 +113,7 @@ class _Publisher:
     def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
         self._station, self._endpoints = station, endpoints
+        station.on_attitude = self._attitude_sent
         self._row = np.zeros(1, NAV_STATE)
         self._events, self._event_number = taps.events, 0
         self._notes = np.zeros(16, taps.events.dtype)
@@ -121,11 +124,15 @@ class _Publisher:
         self._aged = 0
         self._selector = selectors.DefaultSelector()
         self._watching = False
+        self._loop: int | None = None
+        """Descriptor of the loop's process; -1: it had ended before we looked."""
         for endpoint in endpoints:
             self._selector.register(endpoint.link, selectors.EVENT_READ)
 
     def close(self) -> None:
         self._selector.close()
+        if self._loop not in {None, -1}:
+            os.close(self._loop)
 
     def run(self, stop: Wake, report: Connection) -> None:
         self._selector.register(stop, selectors.EVENT_READ)
@@ -133,10 +140,33 @@ class _Publisher:
         ends = (stop, report)
         next_s = time.monotonic()
         while True:
+            self._control.beat("publisher")
+            if self._loop is None and (pid := self._control.loop_pid):
+                self._watch_loop(pid)
             ready = [key.fileobj for key, _ in self._selector.select(max(0.0, next_s - time.monotonic()))]
+            if self._loop is not None and self._loop in ready:
+                self._selector.unregister(self._loop)
+                if self._control.loop_pid:
+                    self._say_died()
             if any(one in ends for one in ready):
                 return
             next_s = self._step(self._wake in ready)
+
+    def _watch_loop(self, pid: int) -> None:
+        try:
+            self._loop = os.pidfd_open(pid)
+        except ProcessLookupError:
+            self._loop = -1
+            if self._control.loop_pid:
+                self._say_died()
+        else:
+            self._selector.register(self._loop, selectors.EVENT_READ)
+
+    def _say_died(self) -> None:
+        self._silent = True
+        self._station.silence()
+        for endpoint in self._endpoints:
+            endpoint.say("error", LOOP_DIED)
 
     def _step(self, called: bool) -> float:
         """Do what is due now; returns when to come again."""
@@ -156,12 +186,11 @@ class _Publisher:
         return any(endpoint.waits for endpoint in self._endpoints)
 
     def _poll(self, now_s: float) -> float:
-        before = sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints)
-        next_s = min((endpoint.poll(now_s) for endpoint in self._endpoints), default=now_s + _SILENCE_S)
-        if sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints) != before:
-            self._ages_ns[self._aged % _AGES] = time.time_ns() - self._row["arrival_ns"][0]
-            self._aged += 1
-        return next_s
+        return min((endpoint.poll(now_s) for endpoint in self._endpoints), default=now_s + _SILENCE_S)
+
+    def _attitude_sent(self) -> None:
+        self._ages_ns[self._aged % _AGES] = time.time_ns() - self._row["arrival_ns"][0]
+        self._aged += 1
 
     def _read(self, now_s: float) -> None:
         count = self._ring.count

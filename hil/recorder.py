@@ -26,6 +26,7 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
             answer.send({"ready": True})
             while True:
                 done = stats["phase"] in (Phase.DONE, Phase.FAILED)
+                control.beat("recorder")
                 number = control.recorded
                 copied, first = ring.pull(batch, number)
                 if first > number:

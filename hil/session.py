@@ -10,7 +10,7 @@ import multiprocessing as mp
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
-from hil.control import run_part
+from hil.control import READERS, run_part
 from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -37,6 +37,8 @@ RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
+STOPPED_S = 3.0
+"""A reader without a beat for so long has stopped."""
 BUSY_NS = 500_000_000
 """A loop that has not asked for frames for so long is busy with those that it has."""
 DRAIN_S = 1.0
@@ -97,6 +99,9 @@ class Session:
         """Frames that the loop had taken when it was last seen at work after the feeder's end."""
         self._began = 0.0
         self._ended = 0.0
+        self._notes: list[tuple[float, str, str]] = []
+        self._stopped: set[str] = set()
+        """Readers that do not answer."""
         self.problems: list[str] = []
         """What went wrong with a part of the run without ending it."""
 
@@ -120,9 +125,11 @@ class Session:
 
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
+            nice = PUBLISHER_NICE if name == "publisher" else 0
+            aside = self.order.realtime and name != "loop"
             process = context.Process(
                 target=run_part,
-                args=(outlets.control, PUBLISHER_NICE if name == "publisher" else 0, target, *args, theirs),
+                args=(outlets.control, nice, aside, target, *args, theirs),
                 name=f"hil-{name}",
                 daemon=True,
             )
@@ -221,12 +228,17 @@ class Session:
         """A copy of the newest `NAV_STATE` row; None before the first."""
         return self._row[0].copy() if self.outlets.states.latest(self._row) else None
 
+    def wait(self, timeout_s: float) -> None:
+        """Sleep, but not longer than a part of the run lives."""
+        wait([part.process.sentinel for part in self._parts.values() if part.process.is_alive()], timeout_s)
+
     def events(self) -> list[tuple[float, str, str]]:
         """(device time, severity, text) of what happened since the last call."""
+        notes, self._notes = self._notes, []
         rows = np.zeros(64, EVENTS)
         copied, first = self.outlets.events.pull(rows, self._event_number)
         self._event_number = first + copied
-        return [
+        return notes + [
             (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace"))
             for row in rows[:copied]
         ]
@@ -247,7 +259,32 @@ class Session:
             if part.name in {"loop", "feeder"} or not self.outlets.control.go:
                 raise HilError(str(failed))
             if failed not in self.problems:
-                self.problems.append(str(failed))
+                self._note(str(failed), "error", problem=True)
+        for name in READERS:
+            self._look_at(name)
+
+    def _look_at(self, reader: str) -> None:
+        """Say that a reader has stopped, or goes on."""
+        part = self._parts.get(reader)
+        if part is None or part.process.exitcode is not None:
+            return
+        stopped = self.outlets.control.beat_age_s(reader) > STOPPED_S
+        if stopped and reader not in self._stopped:
+            self._stopped.add(reader)
+            self._note(
+                f"the {reader} process does not answer: it is stopped or starved, and nothing waits for it",
+                "error",
+                problem=True,
+            )
+        elif not stopped and reader in self._stopped:
+            self._stopped.discard(reader)
+            self._note(f"the {reader} process answers again", "notice")
+
+    def _note(self, text: str, severity: str, *, problem: bool = False) -> None:
+        state = self.state()
+        self._notes.append((0.0 if state is None else float(state["time"]), severity, text))
+        if problem:
+            self.problems.append(text)
 
     def _end(self) -> None:
         self._ended = time.monotonic()
@@ -276,7 +313,7 @@ class Session:
         """What the run showed, as `hil run --json` prints it; complete after the end."""
         stats = self.outlets.stats
         names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
-        more = ("restarts", "interpolated", "silences")
+        more = ("restarts", "interpolated", "silences", "overruns")
         wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
         device_s = stats["covered_us"] * 1e-6
         result: dict[str, Any] = {"scenario": self.order.scenario.name}
@@ -285,6 +322,7 @@ class Session:
         result["wall_s"], result["device_s"] = wall, device_s
         result["speed"] = device_s / wall if wall else 0.0
         result["latency_us"] = stats.quantiles_us(Times.LATENCY)
+        result["times_us"] = {what.name.lower(): stats.quantiles_us(what) for what in Times}
         for name in ("loop", "feeder", "publisher", "recorder"):
             part = self._parts.get(name)
             if part is not None:

@@ -294,7 +294,7 @@ class Strapdown:
                 alone = done
             self._lead_in(self._lead, step[done], dtheta[done] - gyro_bias * step[done], dvel[done], there)
             done += 1
-        if done == 0:
+        if done == 0 < n:
             alone = self._advance(step, dtheta, dvel, gyro_bias, out)
         elif done < n:
             there = Answers(position[done:], velocity[done:], attitude[done:])

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from drivers.mavlink.commands import answer
 from drivers.mavlink.link import Link
 from drivers.mavlink.messages import KINDS, Kind, Message
-from drivers.mavlink.station import Station
+from drivers.mavlink.station import SEVERITIES, Station
 from nav.state import Health, Mode
 
 _ANNOUNCE_S = 0.5
@@ -102,10 +102,18 @@ class Endpoint:
         """Send a message now."""
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
-        if self.link.send(frame):
-            self.sent[message.get_type()] += 1
-        else:
+        name = message.get_type()
+        if not self.link.send(frame):
             self.dropped += 1
+            return
+        self.sent[name] += 1
+        if name == "ATTITUDE":
+            self.station.on_attitude()
+
+    def say(self, severity: str, text: str) -> None:
+        """Have something said at once, whatever else waits to be told."""
+        if self.link.ready():
+            self._say(SEVERITIES[severity], text)
 
     def send_now(self, name: str) -> bool:
         """Send the newest message `name`; False when there is nothing to say yet."""

@@ -22,11 +22,11 @@ from nav.state import NAV_STATE, Health, Mode
 _SLOWEST_HEARTBEAT_HZ = 0.5
 _NOTES = 16
 """Most notes that wait to be told."""
-_SEVERITIES = {
-    "info": mav.MAV_SEVERITY_INFO,
-    "notice": mav.MAV_SEVERITY_NOTICE,
-    "warning": mav.MAV_SEVERITY_WARNING,
-    "error": mav.MAV_SEVERITY_ERROR,
+SEVERITIES = {
+    "info": int(mav.MAV_SEVERITY_INFO),
+    "notice": int(mav.MAV_SEVERITY_NOTICE),
+    "warning": int(mav.MAV_SEVERITY_WARNING),
+    "error": int(mav.MAV_SEVERITY_ERROR),
 }
 
 
@@ -82,6 +82,8 @@ class Station:
         self.on_command = on_command
         self.intake = intake
         self.on_rate: list[Callable[[str], None]] = []
+        self.on_attitude: Callable[[], None] = lambda: None
+        """Called when ATTITUDE is out on a link."""
         self._rates_hz = {name: kind.rate_hz for name, kind in KINDS.items()} | dict(rates_hz)
         self.parameters = Parameters(self._table())
         self.situation = Situation(vehicle_type=VEHICLES[identity.vehicle])
@@ -111,7 +113,7 @@ class Station:
 
     def tell(self, severity: str, text: str) -> None:
         """Have something said on every link: ``"info"``, ``"notice"``, ``"warning"`` or ``"error"``."""
-        self.notes.append((int(_SEVERITIES[severity]), text))
+        self.notes.append((SEVERITIES[severity], text))
         self.noted += 1
 
     def set_loss(self, lost: int, samples: int) -> None:
