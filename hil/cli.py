@@ -448,11 +448,18 @@ def study(
 
 
 @app.command()
-def bench(as_json: Json = False) -> None:
-    """Measure the speed of each part on this machine."""
+def bench(
+    live: Annotated[
+        bool, typer.Option("--live", help="The live chain with its processes instead of its parts.")
+    ] = False,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Of each run of --live.")] = 20.0,
+    as_json: Json = False,
+) -> None:
+    """Measure the speed of each part on this machine, or of the live chain."""
     from hil.bench import measure
+    from hil.bench.live import rows as live_rows
 
-    rows = measure(_say)
+    rows = live_rows(_say, seconds) if live else measure(_say)
     if as_json:
         print(json.dumps({"rows": rows}))
         return
@@ -460,6 +467,8 @@ def bench(as_json: Json = False) -> None:
         ratio = "" if row["ratio_to_c"] is None else f"   {row['ratio_to_c']:.2f} of C"
         if row["peer_ns"] is not None:
             ratio += f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        if "p99_ns" in row:
+            ratio += f"   p99 {row['p99_ns']:.0f} ns   lost {row['lost']} of {row['samples']}"
         print(f"{row['id']:36} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
