@@ -10,6 +10,8 @@ from hil.ring import Shared
 
 LATENCY_BINS = 100_000
 """Bins of 1 us; the last one holds everything longer."""
+NO_SAMPLE, NO_BOUND = -2, -1
+"""In the place of a bound of the clock: no live sample came; too few came for a bound."""
 
 
 class Phase(IntEnum):
@@ -38,7 +40,12 @@ _FIELDS = (
     "interpolated",
     "silences",
     "recorder_lost",
-    "age_us",
+    "age_us",  # here to host_steps: set by `hil.clock`, live runs only
+    "clock_offset_ns",  # host (clock of the day) less device
+    "clock_drift_e12",  # of the device against the host, 1e-12
+    "clock_bound_ns",  # NO_SAMPLE, NO_BOUND
+    "clock_steps",
+    "host_steps",
     "position_error_mm",  # -1: no truth
     "covered_us",  # device time from the first sample on, all lives of the device together
     "warm_loop",  # steps of `hil.warmup` that are done
@@ -56,7 +63,7 @@ class Stats:
         self._latency = self.record["latency"][0]
         self._words = np.frombuffer(self._shared.memory, np.int64, len(_FIELDS))
         if shared is None:
-            self.record["position_error_mm"] = -1
+            self.record["position_error_mm"], self.record["clock_bound_ns"] = -1, NO_SAMPLE
 
     def __reduce__(self) -> Any:
         return Stats, (self._shared,)
