@@ -57,6 +57,7 @@ class LoopClock:
     def __init__(self, stats: Stats, tell: Callable[[float, Severity, str], None]) -> None:
         self._stats, self._tell = stats, tell
         self._fit, self._host = ClockFit(), HostClock()
+        self._said = (0.0, 0.0, 0, 0)
         self._told = self._host_told = 0
 
     def take(self, device_s: float, arrival_ns: int) -> None:
@@ -64,17 +65,14 @@ class LoopClock:
         fit, host = self._fit, self._host
         ahead_ns, clear = host.look(time.monotonic_ns(), time.time_ns(), time.monotonic_ns())
         if clear:
-            age_s = fit.update(device_s, arrival_ns - ahead_ns)
-            bound_s = fit.bound_s
-            values = (
-                round(1e6 * age_s),
-                fit.host_ns(device_s) + ahead_ns - round(1e9 * device_s),
-                round(1e12 * fit.drift),
-                round(1e9 * bound_s) if bound_s < math.inf else NO_BOUND,
-                fit.steps,
-                host.steps,
-            )
-            self._stats.set_block("age_us", values)
+            self._stats["age_us"] = round(1e6 * fit.update(device_s, arrival_ns - ahead_ns))
+            self._stats["clock_offset_ns"] = fit.host_ns(device_s) + ahead_ns - round(1e9 * device_s)
+        said = (fit.drift, fit.bound_s, fit.steps, host.steps)
+        if said != self._said:  # a few times a second
+            self._said = said
+            drift, bound_s, *steps = said
+            bound_ns = round(1e9 * bound_s) if bound_s < math.inf else NO_BOUND
+            self._stats.set_block("clock_drift_e12", (round(1e12 * drift), bound_ns, *steps))
         if fit.steps != self._told:
             self._told = fit.steps
             self._tell(device_s, "warning", f"clock step: device less host changed by {-fit.step_s:+.4f} s")
