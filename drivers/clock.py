@@ -73,7 +73,8 @@ def _quartile(
     for i in range(n):
         work[i] = value[i] - level - slope * (time[i] - time[n - 1])
     work[:n].sort()
-    return work[min(touching - 1 + max(1, n // 4), n - 1)]
+    quartile: float = work[min(touching - 1 + max(1, n // 4), n - 1)]
+    return quartile
 
 
 @kernel

@@ -49,7 +49,8 @@ def fitted(host: FloatArray, device: FloatArray, delay: FloatArray) -> Fitted:
         age = clock.update(shown_s, stamp)
         error = (clock.host_ns(shown_s) - _START_NS) * 1e-9 - true
         rows[:, k] = error, clock.bound_s, clock.drift, age, clock.steps
-    return Fitted(host, *rows, clock)
+    error_s, bound, drift, ages, steps = rows
+    return Fitted(host, error_s, bound, drift, ages, steps, clock)
 
 
 def moments(seconds: float = SECONDS) -> FloatArray:

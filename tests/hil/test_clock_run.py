@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from commands import hil
 
+from drivers.can.dtg_head_emulator import SIMULATED, HeadEncoder
 from drivers.can.frames import FrameArray
 from drivers.logs.recording import RecordingWriter
 from hil.bridge import EVENTS, Loop, LoopOrder, Outlets
@@ -131,11 +132,10 @@ def test_a_live_run_shows_its_clock(hil_bridge: StartBridge, tmp_path: Path) -> 
     assert log["offset_s"] == pytest.approx(said["offset_s"], abs=0.02)
 
 
-def fast_head(scenario: Scenario, control: Control, stats: Stats, answer: Any) -> None:
+def fast_head(scenario: Scenario, control: Control, _: Stats, answer: Any) -> None:
     """A simulated head in a process of its own whose clock gains 2000 ppm."""
     head = SimulatedHead(scenario)
     head.step /= 1.002  # its frames keep their times and go out earlier
-    stats["warm_head"] = 0
     while not (control.go or control.stop):
         time.sleep(0.005)
     answer.send(feed(head, scenario, paced=True, cancelled=lambda: control.stop))
@@ -169,12 +169,28 @@ def test_a_recording_shows_drift_and_delay(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", [-0.5, 0.5])
-def test_a_recording_tells_whose_clock_stepped(tmp_path: Path, step: float) -> None:
-    """The samples are counted: a device whose time and count part has stepped, else the host has."""
-    of_host = stamped(40.0)
-    of_host["time_ns"][2500:] += round(step * 1e9)
-    said = json.loads(hil("clock", recorded(tmp_path / "h.dhil", of_host), "--json")[0])
+def test_a_recording_tells_a_step_of_the_host(tmp_path: Path, step: float) -> None:
+    batch = stamped(40.0)
+    batch["time_ns"][2500:] += round(step * 1e9)
+    said = json.loads(hil("clock", recorded(tmp_path / "h.dhil", batch), "--json")[0])
     assert [(s["clock"], s["step_s"]) for s in said["steps"]] == [("host", pytest.approx(-step, abs=2e-3))]
+
+
+def test_a_recording_tells_a_step_of_the_device(tmp_path: Path) -> None:
+    """The samples are counted: time and count of the device part."""
+    numbers, encoder = (
+        np.arange(4000),
+        HeadEncoder("fd", 10_000, serial=1, world_id=0, hardware=SIMULATED, rotor_hz=0.0),
+    )
+    ends = (numbers + 1) * 10_000 + np.where(numbers >= 2500, 300_000, 0)
+    slow, zeros = encoder.slow(), np.zeros((4000, 4))
+    samples = encoder.samples(numbers, ends, zeros, zeros[:, :3], np.zeros(4000, np.int64), zeros)
+    batch = np.concatenate([slow, samples])
+    late = np.random.default_rng(2).exponential(150e-6, len(samples))
+    batch["time_ns"] = START
+    batch["time_ns"][len(slow) :] += np.rint((numbers * 0.01 + late) * 1e9).astype(np.int64)
+    said = json.loads(hil("clock", recorded(tmp_path / "d.dhil", batch), "--json")[0])
+    assert [(s["clock"], s["step_s"]) for s in said["steps"]] == [("device", pytest.approx(0.3, abs=2e-3))]
 
 
 def test_a_plot_is_drawn(tmp_path: Path) -> None:
