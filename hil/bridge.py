@@ -15,6 +15,7 @@ import math
 import signal
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -25,9 +26,9 @@ from numpy.typing import NDArray
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, is_aiding
 from drivers.can.frames import FrameArray, frames
-from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
+from hil.clock import LoopClock
 from hil.control import Control
 from hil.magnetometer import correct
 from hil.realtime import claim
@@ -147,7 +148,7 @@ class Loop:
         self._trace = Trace() if order.reference is not None else None
         self._reference = order.reference
         self._keep_trace = order.keep_trace
-        self._clock = ClockMap()
+        self._clock = LoopClock(outlets.stats, partial(self.navigator.tell, station=True))
         self._restarts = 0
         self._arrival_ns = 0
         self._started: float | None = None
@@ -234,9 +235,7 @@ class Loop:
         stats = self._outlets.stats
         if self._live:
             stats.count_since(Times.LATENCY, time.time_ns(), arrivals)
-            age_s = self._clock.update(float(imu.time[-1]), arrival)
-            stats.count(Times.AGE, round(1e9 * age_s))
-            stats["age_us"] = round(1e6 * age_s)
+            self._clock.take(float(imu.time[-1]), arrival)
         if len(rows) != len(imu):
             stats["interpolated"] += len(rows) - len(imu)
 

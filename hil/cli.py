@@ -289,6 +289,27 @@ def allan(
 
 
 @app.command()
+def clock(
+    file: Annotated[Path, typer.Argument(help="Recording of a live run.")],
+    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot arrivals, fit, bound and steps (.svg, .png).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the clock of a recorded board with the host's: offset, drift, bound, steps."""
+    from hil.clock_log import clock_log
+    from hil.plot import check_plot, plot_clock
+
+    if plot is not None:
+        check_plot(plot)
+    log = clock_log(file, imu)
+    if plot is not None:
+        plot_clock(plot, log, file.name)
+    _report({"file": str(file), **log.summary()}, as_json=as_json)
+    if log.problem:
+        raise RunFailed(log.problem)
+
+
+@app.command()
 def record(
     file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
     bus: Annotated[str, typer.Option(help="Bus URL.")],

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from hil.clock import clock_reading
 from hil.session import Session
 from nav.rotation import euler_from_quaternion
 from nav.state import Health, Mode
@@ -84,6 +85,8 @@ class RunView:
             f"age {stats['age_us'] / 1000:.2f} ms",
             f"lost {stats['lost']}",
         ]
+        if (clock := clock_reading(stats)) is not None:
+            parts.append(f"clock {clock.drift_ppm:+.1f} ppm")
         if mode == Mode.ALIGN:
             parts.append(f"ALIGN {100 * float(state['progress']):.0f} %")
         else:
@@ -127,6 +130,9 @@ def print_summary(summary: dict[str, Any]) -> None:
         ("MAVLink messages sent", str(sum(summary["mavlink_sent"].values()))),
     ):
         table.add_row(name, value)
+    if (clock := summary.get("clock", {})).get("bound_us") is not None:
+        own = f"{clock['drift_ppm']:+.3f} ppm, known to {clock['bound_us']:.3g} us, {clock['steps']} steps"
+        table.add_row("clock of the device", own)
     if "estimate" in summary:
         sigma = summary["estimate"]["sigma"]
         own = f"{sigma['position_m']:.3g} m, {sigma['velocity_ms']:.3g} m/s, {sigma['attitude_deg']:.3g} deg"

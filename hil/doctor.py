@@ -13,6 +13,7 @@ from typing import Literal
 
 from drivers import driver_names
 from hil.realtime import refused
+from drivers.utc import PULSES
 from nav.errors import HilError
 
 ARPHRD_CAN = "280"
@@ -107,6 +108,7 @@ def _real_time() -> Iterator[Finding]:
     slow = source in {"hpet", "acpi_pm", "jiffies"}
     mend = "choose tsc (kernel parameter clocksource=tsc): every look at the clock costs microseconds" if slow else ""
     yield Finding("clock source", "lack" if slow else "ok", source, mend)
+    yield Finding("pulse lines (PPS)", "info", ", ".join(sorted(line.name for line in PULSES.glob("pps*"))) or "none")
     yield Finding("processors", "info", f"{len(os.sched_getaffinity(0))} usable of {os.cpu_count()}")
 
 

@@ -24,10 +24,12 @@ from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.intake import Intake
 from drivers.mavlink.link import open_link
 from drivers.mavlink.station import Identity, Station
+from hil.clock import clock_reading
 from hil.control import Control
 from hil.geoid import undulation
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
+from hil.stats import Stats
 from nav.errors import HilError
 from nav.state import NAV_STATE
 
@@ -58,6 +60,8 @@ class Taps:
         Of `FRAME`: takes measurements from the network to the loop.
     early : bool
         They serve the alignment as well.
+    stats : Stats, optional
+        What the loop's clock says is published.
     """
 
     states: Ring
@@ -66,6 +70,7 @@ class Taps:
     control: Control
     aiding: Ring | None = None
     early: bool = False
+    stats: Stats | None = None
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -112,6 +117,7 @@ class _Publisher:
 
     def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
+        self._stats = taps.stats
         self._station, self._endpoints = station, endpoints
         station.on_attitude = self._attitude_sent
         self._row = np.zeros(1, NAV_STATE)
@@ -202,6 +208,8 @@ class _Publisher:
             self._silent = True
             self._station.silence()
         self._station.set_loss(self._control.lost, self._control.samples)
+        if self._stats is not None:
+            self._station.set_clock(clock_reading(self._stats))
         copied, first = self._events.pull(self._notes, self._event_number)
         self._event_number = first + copied
         for note in self._notes[:copied][self._notes["station"][:copied]]:

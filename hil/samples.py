@@ -65,11 +65,11 @@ def read_samples(path: Path, driver_name: str | None = None) -> Samples:
         order = {"sequence": np.arange(len(table), dtype=float), "validity": np.zeros(len(table))}
         named = dict(zip(IMU_HEADER, table.T, strict=True))
         return Samples({"time_s": named.pop("time_s"), "step_s": step, **order, **named}, "")
-    driver, source = make_driver(driver_name or _driver_of(path)), FileSource(path, paced=False)
+    driver, source = make_driver(driver_name or driver_of(path)), FileSource(path, paced=False)
     parts = [_columns(samples) for batch in source.batches(1024) if len(samples := driver.decode(batch))]
     if not parts:
         raise HilError(
-            f"{path}: no samples of {driver_name or _driver_of(path)} in it: give the board's driver with --imu"
+            f"{path}: no samples of {driver_name or driver_of(path)} in it: give the board's driver with --imu"
         )
     return Samples({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, source.problem())
 
@@ -115,7 +115,14 @@ def coefficients(axis: str, fit: AllanFit) -> dict[str, float]:
     }
 
 
-def _driver_of(path: Path) -> str:
+def driver_of(path: Path) -> str:
+    """Name of the driver of the board in our own recording.
+
+    Raises
+    ------
+    HilError
+        The recording does not say it.
+    """
     if not is_own(path):
         raise HilError(f"{path}: it does not say what board is in it: give the driver with --imu")
     return str((scenario_table(path) or {}).get("driver", "dtg-head"))

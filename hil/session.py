@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from drivers.utc import PulseClock
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
+from hil.clock import clock_summary
 from hil.control import READERS, run_part
 from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
@@ -97,6 +99,7 @@ class Session:
         self._feeder_ended: float | None = None
         self._drained = 0
         """Frames that the loop had taken when it was last seen at work after the feeder's end."""
+        self._pulses = PulseClock()
         self._began = 0.0
         self._ended = 0.0
         self._notes: list[tuple[float, str, str]] = []
@@ -147,7 +150,7 @@ class Session:
         if self._publish and scenario.mavlink.links:
             live = self.order.paced and self.order.file is None
             network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early)
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, outlets.stats)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:
@@ -184,6 +187,7 @@ class Session:
             The loop or the feeder failed.
         """
         self._watch()
+        self._pulses.poll()
         if not self.ready:
             return True
         feeder = self._parts.get("feeder")
@@ -323,6 +327,10 @@ class Session:
         result["speed"] = device_s / wall if wall else 0.0
         result["latency_us"] = stats.quantiles_us(Times.LATENCY)
         result["times_us"] = {what.name.lower(): stats.quantiles_us(what) for what in Times}
+        if (clock := clock_summary(stats)) is not None:
+            result["clock"] = clock
+            if (utc := self._pulses.summary()) is not None:
+                clock["utc"] = utc
         for name in ("loop", "feeder", "publisher", "recorder"):
             part = self._parts.get(name)
             if part is not None:

@@ -12,6 +12,8 @@ from nav.kernel import kernel
 
 BINS = 100_000
 """Bins of 1 us; the last one holds everything longer."""
+NO_SAMPLE, NO_BOUND = -2, -1
+"""In the place of a bound of the clock: no live sample came; too few came for a bound."""
 
 
 class Phase(IntEnum):
@@ -41,7 +43,12 @@ _FIELDS = (
     "silences",
     "recorder_lost",
     "overruns",  # rounds that took longer than the samples that they held
-    "age_us",
+    "age_us",  # here to host_steps: set by `hil.clock`, live runs only
+    "clock_offset_ns",  # host (clock of the day) less device
+    "clock_drift_e12",  # of the device against the host, 1e-12
+    "clock_bound_ns",  # NO_SAMPLE, NO_BOUND
+    "clock_steps",
+    "host_steps",
     "position_error_mm",  # -1: no truth
     "covered_us",  # device time from the first sample on, all lives of the device together
     "warm_loop",  # steps of `hil.warmup` that are done
@@ -91,7 +98,7 @@ class Stats:
         self._longest = [record["longest"][0, what : what + 1] for what in Times]
         self._words = np.frombuffer(self._shared.memory, np.int64, len(_FIELDS))
         if shared is None:
-            self["position_error_mm"] = -1
+            self["position_error_mm"], self["clock_bound_ns"] = -1, NO_SAMPLE
 
     def __reduce__(self) -> Any:
         return Stats, (self._shared,)

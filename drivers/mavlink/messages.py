@@ -46,6 +46,20 @@ GOOD_POSITION_M, GOOD_VELOCITY_MS, GOOD_ATTITUDE = 10.0, 1.0, math.radians(5.0)
 
 
 @dataclass(frozen=True)
+class ClockReading:
+    """The device's clock against the host's."""
+
+    offset_ns: int
+    """Host (UTC) less device."""
+    drift_ppm: float
+    """Positive: the device's clock is fast."""
+    bound_us: float
+    """Of the offset, beside the smallest delay of the transport, which is in it."""
+    steps: int
+    """Of either clock."""
+
+
+@dataclass(frozen=True)
 class Situation:
     """What a message says beside the solution."""
 
@@ -55,6 +69,7 @@ class Situation:
     """Sensor samples lost since the start."""
     samples: int = 0
     """Sensor samples received since the start."""
+    clock: ClockReading | None = None
 
 
 def heartbeat(solution: Solution, situation: Situation) -> Message:
@@ -94,11 +109,21 @@ def sys_status(solution: Solution, situation: Situation) -> Message:
     )
 
 
-def system_time(solution: Solution, _: Situation) -> Message | None:
-    """SYSTEM_TIME: host time (UTC) at which the sample of this device time arrived."""
+def system_time(solution: Solution, situation: Situation) -> Message | None:
+    """SYSTEM_TIME: host time (UTC) of this device time; the arrival of the sample while the clocks are not compared."""
     if not solution.has_imu:
         return None
-    return mav.MAVLink_system_time_message(max(solution.arrival_ns, 0) // 1000, _boot_ms(solution))
+    clock = situation.clock
+    host_ns = solution.arrival_ns if clock is None else round(solution.time * 1e9) + clock.offset_ns
+    return mav.MAVLink_system_time_message(max(host_ns, 0) // 1000, _boot_ms(solution))
+
+
+def debug_vect(solution: Solution, situation: Situation) -> Message | None:
+    """DEBUG_VECT named CLOCK: drift of the device's clock (ppm), bound of its offset (us), steps."""
+    clock = situation.clock
+    if clock is None or not solution.has_imu:
+        return None
+    return mav.MAVLink_debug_vect_message(b"CLOCK", _boot_us(solution), clock.drift_ppm, clock.bound_us, clock.steps)
 
 
 def attitude(solution: Solution, _: Situation) -> Message | None:
@@ -261,6 +286,7 @@ KINDS = {
     "ESTIMATOR_STATUS": Kind(estimator_status, 2.0, "SR_EST_HZ"),
     "EKF_STATUS_REPORT": Kind(ekf_status_report, 2.0, "SR_EKF_HZ"),
     "SYSTEM_TIME": Kind(system_time, 1.0, "SR_TIME_HZ"),
+    "DEBUG_VECT": Kind(debug_vect, 1.0, "SR_CLOCK_HZ"),
     "GPS_RAW_INT": Kind(gps_raw_int, 1.0, "SR_GPS_HZ"),
     "SYS_STATUS": Kind(sys_status, 2.0, "SR_SYS_HZ", from_solution=False),
     "HOME_POSITION": Kind(home_position, 0.2, "SR_HOME_HZ", from_solution=False),

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.commands import SHORTEST_INTERVAL_S
 from drivers.mavlink.intake import Intake
-from drivers.mavlink.messages import KINDS, VEHICLES, Situation
+from drivers.mavlink.messages import KINDS, VEHICLES, ClockReading, Situation
 from drivers.mavlink.parameters import Parameter, Parameters
 from drivers.mavlink.solution import Home, Solution, Undulation
 from nav.errors import HilError
@@ -120,6 +120,11 @@ class Station:
         """Sensor samples lost and received since the start."""
         if (lost, samples) != (self.situation.lost, self.situation.samples):
             self.situation = replace(self.situation, lost=lost, samples=samples)
+
+    def set_clock(self, clock: ClockReading | None) -> None:
+        """What is known of the device's clock against the host's."""
+        if clock != self.situation.clock:
+            self.situation = replace(self.situation, clock=clock)
 
     def device_ns(self) -> int:
         """Device time now, ns; the caller's clock before the first solution."""

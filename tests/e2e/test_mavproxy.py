@@ -96,7 +96,7 @@ def test_mavproxy_is_content(tmp_path: Path) -> None:
     assert "link 1 OK" in output
     assert "0.0% loss" in output
     assert "Detected vehicle 1:1" in output
-    assert "Received 18 parameters" in output
+    assert "Received 19 parameters" in output
     assert "SYSID_THISMAV" in output
     assert "online system 1" in output
     for warning in (

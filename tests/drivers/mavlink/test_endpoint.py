@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from drivers.mavlink.commands import MESSAGE_NAMES
 from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.link import StreamLink, UdpLink, open_link
-from drivers.mavlink.messages import KINDS
+from drivers.mavlink.messages import KINDS, ClockReading
 from drivers.mavlink.station import Identity, Station
 from nav.errors import HilError
 from nav.state import NAV_STATE, Health, Mode
@@ -35,6 +35,7 @@ class Bench:
     def __init__(self, url: str, dial: Callable[[Any], tuple[Callable[[bytes], Any], Callable[[], bytes]]]) -> None:
         self.commands: list[str] = []
         self.station = Station(Identity(), {}, lambda lat, lon: 20.0, self.commands.append)
+        self.station.set_clock(ClockReading(10**18, 1.0, 1.0, 0))
         self.link: Any = open_link(url)
         self.endpoint = Endpoint(self.station, self.link)
         self.write, self.read = dial(self.link)
