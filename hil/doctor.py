@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from drivers import driver_names
-from hil.realtime import refused
 from drivers.utc import PULSES
+from hil.realtime import refused
 from nav.errors import HilError
 
 ARPHRD_CAN = "280"
