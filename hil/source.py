@@ -11,8 +11,12 @@ import numpy as np
 from drivers.can.bus import open_port
 from drivers.can.convert import from_message
 from drivers.can.frames import FrameArray, frames
+from drivers.logs.blf import BlfReader
 from drivers.logs.recording import EVENT, MAGIC, RecordingReader
 from nav.errors import HilError
+
+_READERS: dict[str, Any] = {".log": can.CanutilsLogReader, ".blf": BlfReader, ".asc": can.ASCReader}
+"""By file ending; python-can finds the others itself, among its plug-ins."""
 
 
 class Source(Protocol):
@@ -86,7 +90,7 @@ class FileSource:
     def _foreign(self) -> Iterator[FrameArray]:
         chunk, n, total = frames(256), 0, 0
         try:
-            with can.LogReader(self.path) as reader:
+            with _READERS.get(self.path.suffix.lower(), can.LogReader)(self.path) as reader:
                 for message in reader:
                     from_message(message, chunk[n])
                     n += 1
