@@ -1,8 +1,17 @@
 """Damage to valid input, spelled by bytes: the same bytes always do the same, fewer bytes do less."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-_WORDS = (b"\x00" * 8, b"\xff" * 8, b"\x7f" + b"\xff" * 7, b"\x80" + b"\x00" * 7, b"nan", b"1e999", b"9" * 400, b"[" * 2000)
+_WORDS = (
+    b"\x00" * 8,
+    b"\xff" * 8,
+    b"\x7f" + b"\xff" * 7,
+    b"\x80" + b"\x00" * 7,
+    b"nan",
+    b"1e999",
+    b"9" * 400,
+    b"[" * 2000,
+)
 EDIT = 4
 """Bytes that spell one edit."""
 
@@ -20,23 +29,16 @@ def edited(seeds: Sequence[bytes], script: bytes) -> bytes:
 def _patch(op: int, value: int, data: bytes, at: int, seeds: Sequence[bytes]) -> bytes:
     """What stands from `at` on after an edit."""
     rest = data[at:]
-    match op % 9:
-        case 0:
-            return bytes([value]) + rest[1:]
-        case 1:
-            return bytes([rest[0] ^ 1 << value % 8]) + rest[1:] if rest else rest
-        case 2:
-            return rest[value:]
-        case 3:
-            return bytes([value]) * (op // 9 + 1) + rest
-        case 4:
-            return rest[:value] * 2 + rest[value:]
-        case 5:
-            return b""
-        case 6:
-            word = _WORDS[value % len(_WORDS)]
-            return word + rest[len(word) if value & 128 else 0 :]
-        case 7:
-            return seeds[value % len(seeds)][min(at, 1) :]
-        case _:
-            return rest[value:] + rest[:value]
+    word = _WORDS[value % len(_WORDS)]
+    edits: tuple[Callable[[], bytes], ...] = (
+        lambda: bytes([value]) + rest[1:],
+        lambda: bytes([rest[0] ^ 1 << value % 8]) + rest[1:] if rest else rest,
+        lambda: rest[value:],
+        lambda: bytes([value]) * (op // 9 + 1) + rest,
+        lambda: rest[:value] * 2 + rest[value:],
+        lambda: b"",
+        lambda: word + rest[len(word) if value & 128 else 0 :],
+        lambda: seeds[value % len(seeds)][min(at, 1) :],
+        lambda: rest[value:] + rest[:value],
+    )
+    return edits[op % len(edits)]()

@@ -1,4 +1,4 @@
-"""Fuzz targets: recordings, flight logs, and the files that people write. Each input is a file of its own in memory's file system."""
+"""Fuzz targets: recordings, flight logs, and the files that people write. Each input is a file in memory."""
 
 import io
 import json
@@ -146,7 +146,10 @@ def ulog() -> Made:
     path = _file("seed.ulg")
     old = made(path, base(15), EKF2_BARO_DELAY=30.0).read_bytes()
     fixes = [(10**6 + 4000 * k, 500_000_000, 300_000_000, 1000, 0.1, 1.0, 2.0, 0.0, 0.0, 0.0, 3) for k in range(3)]
-    aided = base(10) | {("vehicle_gps_position", 0): fixes, ("vehicle_magnetometer", 1): [(1_004_000, 0.2, 0.0, 0.4)] * 2}
+    aided = base(10) | {
+        ("vehicle_gps_position", 0): fixes,
+        ("vehicle_magnetometer", 1): [(1_004_000, 0.2, 0.0, 0.4)] * 2,
+    }
     return _reader("fuzz.ulg", lambda path: _is_whole(read_ulog(path))), [old, made(path, aided).read_bytes()]
 
 
@@ -306,5 +309,3 @@ def _archive(header: tuple[str, ...], table: FloatArray, **columns: Any) -> byte
     stream = io.BytesIO()
     np.savez(stream, **dict(zip(header, table.T, strict=True)) | columns)
     return stream.getvalue()
-
-

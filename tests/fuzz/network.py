@@ -3,6 +3,7 @@
 import re
 import struct
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,7 @@ def mavlink() -> tuple[Callable[[bytes], None], list[bytes]]:
             body = mended(body)
         if how & 2:
             starts = [0, *(found.start() for found in _MARKER.finditer(body)), len(body)]
-            pieces = [body[a:b] for a, b in zip(starts, starts[1:], strict=False) if b > a]
+            pieces = [body[a:b] for a, b in pairwise(starts) if b > a]
         else:
             size = 1 + (how >> 2) * 8
             pieces = [body[k : k + size] for k in range(0, len(body), size)]
@@ -116,7 +117,14 @@ def _message(name: str) -> Any:
     fields: dict[str, Any] = {}
     for field, kind in zip(made.fieldnames, made.fieldtypes, strict=True):
         fields[field] = b"HIL_COMPID" if kind == "char" else [1] * lengths[field] if lengths[field] else 1
-    known = {"fix_type": 3, "lat": 500_000_000, "lon": 300_000_000, "frame_id": 1, "child_frame_id": 12, "param_type": 9}
+    known = {
+        "fix_type": 3,
+        "lat": 500_000_000,
+        "lon": 300_000_000,
+        "frame_id": 1,
+        "child_frame_id": 12,
+        "param_type": 9,
+    }
     return made(**(fields | {key: value for key, value in known.items() if key in fields}))
 
 

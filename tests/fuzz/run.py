@@ -2,7 +2,7 @@
 
     run.py [--runs N] [--seconds N] [TARGET ...]
 
-A target runs until it has had `--runs` inputs or `--seconds` are over. What it has learnt, and inputs that fail, stay in `.fuzz/`.
+A target runs until it has had `--runs` inputs or `--seconds` are over. What it has learnt, and inputs that fail, stay in .fuzz.
 """
 
 import argparse
@@ -30,7 +30,6 @@ LATE = ("pymavlink.DFReader", "pyulog.core")
 def one(name: str, arguments: list[str]) -> None:
     """Fuzz one target in this process; libFuzzer ends it."""
     import atheris
-
     from fuzz.targets import TARGETS
 
     for module in LATE:
@@ -83,7 +82,7 @@ def watched(name: str, runs: int, seconds: int) -> tuple[int, int, int, str]:
 def record(name: str, row: str) -> None:
     """Put the row of a target into the table of the page."""
     lines = [line for line in PAGE.read_text().splitlines() if not line.startswith(f"| `{name}` |")]
-    end = max(k for k, line in enumerate(lines) if line.startswith("| `") or line.startswith("| ---")) + 1
+    end = max(k for k, line in enumerate(lines) if line.startswith(("| `", "| ---"))) + 1
     PAGE.write_text("\n".join([*lines[:end], row, *lines[end:], ""]))
 
 
