@@ -389,7 +389,7 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
             _run(loop, source, order, outlets)
         finally:
             source.close()
-        result = loop.result()
+        result = loop.result() | {"overflowed": source.overflowed}
         if source.problem():
             result["problem"] = source.problem()
         stats["phase"] = Phase.DONE

@@ -33,6 +33,10 @@ class Source(Protocol):
     def close(self) -> None:
         """Let go."""
 
+    @property
+    def overflowed(self) -> int:
+        """Frames that were lost before they could be taken, because a buffer was full."""
+
     def problem(self) -> str:
         """What went wrong with the source, in a line; empty when nothing."""
 
@@ -54,9 +58,20 @@ class BusSource:
         self._port.close()
 
     def problem(self) -> str:
-        """Failures of the interface."""
+        """Failures of the interface, and frames that it lost."""
         failures = getattr(self._port, "failures", 0)
-        return f"the bus failed {failures} times and was reopened" if failures else ""
+        said = [f"the bus failed {failures} times and was reopened"] if failures else []
+        if self.overflowed:
+            said.append(
+                f"{self.overflowed} frames were lost because the receive buffer was full: raise net.core.rmem_max"
+            )
+        return "; ".join(said)
+
+    @property
+    def overflowed(self) -> int:
+        """See `Source.overflowed`."""
+        count: int = getattr(self._port, "overflowed", 0)
+        return count
 
 
 class FileSource:
@@ -69,6 +84,8 @@ class FileSource:
     paced : bool
         Hand frames out at the times at which they were recorded; else as fast as they are asked for.
     """
+
+    overflowed = 0
 
     def __init__(self, path: Path, *, paced: bool) -> None:
         self.live = False

@@ -2,8 +2,8 @@
 
 Two programs run them: `test_fuzz.py` (hypothesis, in CI) and `run.py` (atheris, `make fuzz`). A target may raise `HilError`; any
 other error, a sample that is not finite, a count that does not add up or memory that grows is a fault. Random bytes pass no
-check: the lowest bit of the first byte of a wire's input says that checks are made right again before the parser sees them, its other
-bits how the input is cut. `TARGETS` makes a target by name; making one loads its parser.
+check: the lowest bit of the first byte of a wire's input says that checks are made right again before the parser sees them,
+its other bits how the input is cut. `TARGETS` makes a target by name; making one loads its parser.
 """
 
 from collections.abc import Callable
