@@ -24,7 +24,7 @@ from drivers.can.frames import FRAME, FrameArray
 from drivers.can.j1939 import J1939Imu
 from drivers.logs.dataflash import read_dataflash
 from drivers.logs.imu_log import ImuLog
-from drivers.logs.recording import MAGIC, RecordingWriter, event_record
+from drivers.logs.recording import EVENT, MAGIC, RecordingWriter, event_record
 from drivers.logs.ulog import read_ulog
 from drivers.serial.chunks import to_chunks
 from hil.aid_file import AID_HEADER, read_aiding
@@ -73,8 +73,8 @@ def recording() -> Made:
     def take(data: bytes) -> None:
         path.write_bytes(_mended(data[1:]) if data[:1] == b"\x01" else data[1:])
         source, driver, count = FileSource(path, paced=False), DtgHead(), 0
-        for batch in source.batches(7):
-            assert not batch["reserved"][:, 0].any() or batch["reserved"][:, 0].min() != 1
+        for batch in source.batches(64):
+            assert (batch["reserved"][:, 0] != EVENT).all()
             driver.decode(batch)
             count += len(batch)
         assert source.exhausted
