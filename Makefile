@@ -3,6 +3,7 @@
 #   make run   [ARGS="--duration 10"]   the bridge with its built-in scenario
 #   make test  [ARGS="-k ring"]         all tests, those on real SocketCAN included
 #   make studies                        the studies of several minutes, whole
+#   make fuzz  [TARGET="blf sbg"] [RUNS=1000000] [SECONDS=600]  atheris on the parsers, for hours; writes docs/fuzzing.md
 #   make lint                           ruff, mypy, import rules
 #   make dev                            .venv with everything that a developer needs
 #   make vcan                           install what the SocketCAN tests need on a kernel without CAN (Debian, root or sudo)
@@ -12,7 +13,7 @@ SHELL := /bin/bash
 PYTHON ?= python3
 ARGS ?=
 
-.PHONY: run test studies lint dev vcan clean
+.PHONY: run test studies fuzz lint dev vcan clean
 .DELETE_ON_ERROR:
 
 run: .venv/.installed-run
@@ -24,6 +25,9 @@ test: .venv/.installed-test
 studies: .venv/.installed-test
 	@.venv/bin/python -m pytest -m study $(ARGS)
 
+fuzz: .venv/.installed-fuzz
+	@.venv/bin/python tests/fuzz/run.py --runs $(or $(RUNS),1000000) --seconds $(or $(SECONDS),0) $(TARGET)
+
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
@@ -34,6 +38,7 @@ dev: .venv/.installed-dev
 
 .venv/.installed-run: EXTRAS = logs
 .venv/.installed-test: EXTRAS = logs,plot,magnetic,test
+.venv/.installed-fuzz: EXTRAS = logs,magnetic,test,fuzz
 .venv/.installed-dev: EXTRAS = logs,plot,magnetic,test,dev
 
 .venv/.installed-%: pyproject.toml constraints.txt | .venv/bin/pip
@@ -59,5 +64,5 @@ vcan:
 	install 2>/dev/null || { $$root apt-get update -qq && install; }
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .coverage
+	rm -rf .venv .fuzz build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .coverage
 	find hil drivers nav fixtures tests -name __pycache__ -prune -exec rm -rf {} +

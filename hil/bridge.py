@@ -400,7 +400,7 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         finally:
             outlets.control.loop_ends()
             source.close()
-        result = loop.result()
+        result = loop.result() | {"overflowed": source.overflowed}
         if granted:
             result["realtime"] = granted.as_dict()
         if source.problem():

@@ -64,7 +64,8 @@ def record_bus(
     finally:
         port.close()
     left_out = {"not_exported": chunks} if path.suffix != ".dhil" and chunks else {}
-    return {"file": str(path), "frames": count, **left_out, "seconds": time.monotonic() - began}
+    lost = {"overflowed": getattr(port, "overflowed", 0)}
+    return {"file": str(path), "frames": count, **lost, **left_out, "seconds": time.monotonic() - began}
 
 
 class _writer:

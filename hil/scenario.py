@@ -5,7 +5,6 @@ laid over the file with `Scenario.with_changes`.
 """
 
 import json
-import tomllib
 import zlib
 from collections.abc import Mapping
 from importlib.resources import files
@@ -14,6 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hil.toml import parse_toml
 from nav.errors import HilError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -441,11 +441,7 @@ def parse(text: str, source: str, folder: Path = Path()) -> Scenario:
     HilError
         As for `load`.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise HilError(f"scenario {source}: not TOML: {error}") from error
-    return validated(table, source, folder)
+    return validated(parse_toml(text, f"scenario {source}"), source, folder)
 
 
 def built_in_names() -> list[str]:

@@ -1,7 +1,8 @@
 """Opening a bus by URL: the bulk interface that the bridge, the head and the tools use on every CAN back end.
 
 ``unix:NAME`` (:mod:`drivers.can.unix_bus`), ``socketcan:vcan0`` (:mod:`drivers.can.socketcan`) and
-``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own; anything else is python-can: ``virtual:NAME``,
+``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own (``socketcan:can0?filter=120:7F0`` has the kernel keep
+other frames back); anything else is python-can: ``virtual:NAME``,
 ``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
 """
 
@@ -16,7 +17,7 @@ import can
 
 from drivers.can.convert import from_message, to_message
 from drivers.can.frames import FrameArray
-from drivers.can.socketcan import SocketCanPort, explain
+from drivers.can.socketcan import SocketCanPort, explain, parse_filters
 from drivers.can.unix_bus import UnixPort
 from nav.errors import HilError
 
@@ -70,9 +71,11 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
         from drivers.serial.port import SerialPort
 
         return SerialPort(url)
-    if interface == "socketcan" and not query:
-        return SocketCanPort(channel, listen=listen)
-    options = {key: _typed(value) for key, value in parse_qsl(query, keep_blank_values=True)}
+    words = dict(parse_qsl(query, keep_blank_values=True))
+    if interface == "socketcan" and words.keys() <= {"filter"}:
+        filters = parse_filters(words["filter"]) if words else ()
+        return SocketCanPort(channel, listen=listen, filters=filters)
+    options = {key: _typed(value) for key, value in words.items()}
     return PythonCanPort(url, interface, channel, options)
 
 

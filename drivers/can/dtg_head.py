@@ -6,6 +6,7 @@ comes late, one that was seen is a duplicate, both are dropped; anything else is
 unwrapped from its 32 bits of microseconds. A sample after a gap covers one nominal period, not the gap.
 """
 
+from functools import cache
 from importlib.resources import files
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers import Counters
 from drivers.can.aiding import is_aiding
-from drivers.can.codec import MessageCodec, load_database
+from drivers.can.codec import Database, MessageCodec, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray, as_bytes
 from drivers.can.integrity import Protection, protection
 from drivers.can.samples import signed
@@ -55,6 +56,12 @@ _SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS = range(7)
 def head_database_text() -> str:
     """The DBC of the head's message set, the one truth for driver, emulator and firmware."""
     return (files("fixtures") / "can" / "dtg_head.dbc").read_text("cp1252")
+
+
+@cache
+def head_database() -> Database:
+    """The codecs of the head's message set."""
+    return load_database(head_database_text())
 
 
 @kernel
@@ -219,7 +226,7 @@ class DtgHead:
     """See the module; satisfies `drivers.FrameDriver`."""
 
     def __init__(self) -> None:
-        database = load_database(head_database_text())
+        database = head_database()
         self._sample = database["HEAD_SAMPLE"]
         self._classic = [database[name] for name in CLASSIC]
         self._slow = {database[name].can_id: database[name] for name in SLOW}

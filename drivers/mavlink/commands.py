@@ -33,6 +33,8 @@ _STREAMS = {
 }
 _STREAMS[mav.MAV_DATA_STREAM_ALL] = tuple(name for names in _STREAMS.values() for name in names)
 
+_LONGEST_US = 2**31 - 1
+"""What MESSAGE_INTERVAL can say."""
 _FTP_NAK = 129
 _FTP_FILE_NOT_FOUND = 10
 
@@ -123,7 +125,7 @@ def _get_message_interval(params: list[float], endpoint: "Endpoint") -> int:
         return int(mav.MAV_RESULT_DENIED)
     interval_us = 0  # not available
     if name is not None:
-        interval_us = round(1e6 * endpoint.interval_s(name)) or -1
+        interval_us = round(min(1e6 * endpoint.interval_s(name), _LONGEST_US)) or -1
     endpoint.send(mav.MAVLink_message_interval_message(int(params[0]), interval_us))
     return int(mav.MAV_RESULT_ACCEPTED)
 

@@ -176,7 +176,8 @@ class Endpoint:
         identity = self.station.identity
         if (message.get_srcSystem(), message.get_srcComponent()) == (identity.system_id, identity.component_id):
             return  # our own, looped back
-        self.received[message.get_type()] += 1
+        name = message.get_type()
+        self.received["UNKNOWN" if name.startswith("UNKNOWN_") else name] += 1  # there are 2^24 numbers of messages
         if self.station.intake is not None:
             self.station.intake.message(message, self.station)
         answer(message, self)

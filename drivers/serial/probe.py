@@ -5,7 +5,7 @@ import time
 from dataclasses import dataclass
 
 from drivers import driver_names, make_driver
-from drivers.can.frames import frames
+from drivers.can.frames import FrameArray, frames
 from drivers.serial.driver import SerialDriver
 from drivers.serial.port import SerialPort
 from drivers.serial.stream import ByteStream
@@ -67,12 +67,19 @@ def listen(url: str, names: list[str], seconds: float) -> Heard:
         while (left := deadline - time.monotonic()) > 0.0 and not port.failures:
             n = port.receive(batch, left)
             count += int(batch["length"][:n].sum())
-            for name, stream in streams.items():
-                for _ in stream.take(batch[:n]):
-                    pass
-                if stream.packets >= ENOUGH:
-                    return Heard(name, port.baud, count)
+            if name := hear(streams, batch[:n]):
+                return Heard(name, port.baud, count)
     return Heard("", port.baud, count)
+
+
+def hear(streams: dict[str, ByteStream], batch: FrameArray) -> str:
+    """Give `batch` to the stream of each driver; who has had enough good packets, or nobody."""
+    for name, stream in streams.items():
+        for _ in stream.take(batch):
+            pass
+        if stream.packets >= ENOUGH:
+            return name
+    return ""
 
 
 def probe(place: str, names: list[str] | None = None, listen_s: float = LISTEN_S) -> Heard | None:

@@ -1,8 +1,11 @@
 """Our recording: whatever happens to the file or to its writer, what is read is a true beginning of what was written."""
 
+import struct
 import subprocess
 import sys
 import time
+import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -10,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.can.frames import FRAME, frames
-from drivers.logs.recording import BLOCK, EVENT, SILENCE, RecordingReader, RecordingWriter, event_record
+from drivers.logs.recording import BLOCK, EVENT, MAGIC, SILENCE, RecordingReader, RecordingWriter, event_record
 from nav.errors import HilError
 
 HEADER = {"scenario": {"name": "ü"}, "origin": "test"}
@@ -113,6 +116,24 @@ def test_foreign_files_are_refused(tmp_path, content):
     (tmp_path / "foreign").write_bytes(content)
     with pytest.raises(HilError, match="not a recording of ours at offset 0"):
         RecordingReader.open(tmp_path / "foreign")
+
+
+@pytest.mark.parametrize("text", [b"[1]", b"{", b"\xff", b"[" * 100_000])
+def test_a_header_that_its_check_belies(tmp_path, text):
+    """Its check is right, and it says nothing."""
+    (tmp_path / "odd").write_bytes(MAGIC + struct.pack("<II", len(text), zlib.crc32(text)) + text)
+    with pytest.raises(HilError, match="damaged header"):
+        RecordingReader.open(tmp_path / "odd")
+
+
+def test_a_header_that_says_it_is_huge_takes_no_room(tmp_path):
+    (tmp_path / "huge").write_bytes(MAGIC + struct.pack("<II", 0xFFFFFFFF, 0))
+    tracemalloc.start()
+    with pytest.raises(HilError, match="damaged header"):
+        RecordingReader.open(tmp_path / "huge")
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most < 1 << 26
 
 
 def test_paths_that_cannot_be(tmp_path):

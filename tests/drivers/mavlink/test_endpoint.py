@@ -195,6 +195,21 @@ def test_wrong_intervals_are_refused(bench: Bench, number: float, interval_us: f
     assert the(bench.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, number, interval_us), "COMMAND_ACK").result == result
 
 
+def test_an_interval_longer_than_can_be_told(bench: Bench) -> None:
+    bench.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE, 1e10)
+    told = the(bench.command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_ATTITUDE), "MESSAGE_INTERVAL")
+    assert told.interval_us == 2**31 - 1
+
+
+def test_messages_of_numbers_nobody_knows_are_counted_as_one(bench: Bench) -> None:
+    for number in range(0x500000, 0x500032):
+        bench.write(b"\xfd\0\0\0\0\xff\x01" + number.to_bytes(3, "little") + b"\0\0")
+    bench.settle()
+    while bench.endpoint.received["UNKNOWN"] < 50:
+        bench.settle()
+    assert set(bench.endpoint.received) <= {"UNKNOWN", "HEARTBEAT"}
+
+
 def test_interval_of_a_message_we_do_not_have(bench: Bench) -> None:
     assert the(bench.command(mav.MAV_CMD_GET_MESSAGE_INTERVAL, 12345), "MESSAGE_INTERVAL").interval_us == 0
 
