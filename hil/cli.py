@@ -26,6 +26,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 
 
 app.command()(cli_watch.check_axes)
+app.command()(cli_watch.monitor)
 
 
 class RunFailed(HilError):

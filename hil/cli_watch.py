@@ -59,6 +59,51 @@ def check_axes(
         raise RunFailed(f"axes: {found['verdict']}")
 
 
+def monitor(
+    file: File = None,
+    bus: Bus = None,
+    imu: Annotated[
+        str | None, typer.Option(help="Driver of the board; left out: that of all which understands.")
+    ] = None,
+    dbc: Annotated[list[Path] | None, typer.Option(help="Show the signals of this DBC file too; repeatable.")] = None,
+    duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds, then stop.")] = None,
+    bitrate: Annotated[float | None, typer.Option(help="Of the CAN bus, bits a second, where nothing says it.")] = None,
+    data_bitrate: Annotated[float | None, typer.Option(help="Of the data of CAN FD frames.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Show raw signals with unit, rate and noise, frames by id, bus load and losses. Nothing is sent."""
+    from drivers.can.codec import load_database
+    from hil.monitor import Monitor
+    from hil.watch import bitrates_of, look_first, watch_bus, watch_file
+
+    _one_source(file, bus)
+    databases = [load_database(path) for path in dbc or ()]
+    for path, database in zip(dbc or (), databases, strict=True):
+        for name, reason in database.refused.items():
+            _say(f"{path}: {name} is left out: {reason}")
+    if bus is not None and (hint := look_first(bus, imu)):
+        _say(hint)
+    watched = Monitor(imu, databases, bitrates_of(bus, bitrate, data_bitrate))
+    if file is not None:
+        report = watch_file(watched, file, imu) | {"source": str(file)}
+    else:
+        from hil.cli import StopSignal
+
+        stop = StopSignal()
+        report = watch_bus(watched, str(bus), duration, lambda: stop.wanted, quiet=as_json) | {"source": bus}
+    if as_json:
+        print(json.dumps(report))
+        return
+    from hil.monitor_view import MonitorView
+
+    MonitorView().end(report)
+    if report["driver"] is not None and imu is None:
+        where = f" --bus {bus}" if bus is not None else ""
+        _say(f"the board is understood by {report['driver']}: hil run --imu {report['driver']}{where}")
+    if report["problem"]:
+        _say(report["problem"])
+
+
 def _one_source(file: Path | None, bus: str | None) -> None:
     if (file is None) == (bus is None):
         raise HilError("give a recording, or --bus URL, and not both")
