@@ -157,8 +157,8 @@ def test_a_board_is_recognised_and_its_noise_measured(tmp_path: Path, driver: st
     assert report["driver"] == driver
     axes = ("g1x", "g1y", "g2z") if driver == "dtg-head" else ("x", "y", "z")
     signals = by_name(report)
-    # Rates at the ends of steps make 3/4, 1/2, -1/4 of three samples of white noise; the others send means or increments.
-    factor = np.sqrt(9 + 4 + 1) / 4.0 if driver == "j1939-imu" else 1.0
+    # The boards send rates at the ends of steps: their means make 3/4, 1/2, -1/4 of three samples of white noise.
+    factor = 1.0 if driver == "dtg-head" else np.sqrt(9 + 4 + 1) / 4.0
     for axis in axes:
         rate = signals[f"rate_{axis}"]
         assert (rate["unit"], rate["density_unit"]) == ("deg/s", "deg/s/sqrt(Hz)")
