@@ -390,7 +390,7 @@ def configure(
 
 @app.command()
 def doctor(
-    probe: Annotated[bool, typer.Option("--probe", help="Listen on every serial port for known boards.")] = False,
+    probe: Annotated[bool, typer.Option("--probe", help="Listen on CAN and serial ports for known boards.")] = False,
     as_json: Json = False,
 ) -> None:
     """Say what this machine can do, and the command that mends each lack."""
