@@ -68,7 +68,8 @@ def tables(report: dict[str, Any]) -> RenderableType:
         parts.append(Text("  ".join(f"{name} {value}" for name, value in identity.items())))
     if report["signals"]:
         parts.append(_signals(report["signals"]))
-    parts.append(_identifiers(report["ids"]))
+    if report["ids"]:
+        parts.append(_identifiers(report["ids"]))
     return Group(*parts)
 
 
