@@ -16,7 +16,8 @@ from hil.scenario import HeadConfig, load, validated
 from hil.source import FileSource, is_own, scenario_table
 from hil.world.instruments import head_model
 from nav.alignment.axes import NAMES, Fit, gyro_fit
-from nav.alignment.postures import ORDERS, Postures, judged
+from nav.alignment.postures import FORCES, ORDERS, Postures, judged
+from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, joined
 from nav.instruments.head import HeadCombiner
@@ -26,6 +27,8 @@ MISFIT_DEG = 30.0
 """What is further off fits no axes at all."""
 ASKEW_DEG = 12.0
 """What is further off stands askew: more than a hand errs by."""
+UNIT_SHARE = 0.15
+"""A specific force at rest that is further from 1 g, as a share, is in another unit."""
 WAIT_S = 60.0
 """Longest time for one posture."""
 
@@ -62,6 +65,9 @@ class AxesCheck:
             return said
         said |= {"accelerometer": _said(by_force), "gyro": _said(by_turn)}
         said["ok"], said["verdict"] = _verdict(by_force, by_turn)
+        size = float(np.mean([np.linalg.norm(one.force) for one in self.postures.found])) / STANDARD_GRAVITY
+        if abs(size - 1.0) > UNIT_SHARE:
+            said["verdict"] += f"; but the specific force at rest is {size:.3g} g: is its unit m/s^2?"
         if said["ok"]:
             said["head_axes"] = list(by_force.names)
             if np.degrees(by_force.off) > ASKEW_DEG:
@@ -135,8 +141,6 @@ def _by_motion(found: Fit | None, refusal: str) -> tuple[bool, str]:
 
 def _askew(postures: Postures) -> list[list[float]] | None:
     """The mounting of a board whose axes are not along those of the body."""
-    from nav.alignment.postures import FORCES
-
     forces = np.array([one.force / np.linalg.norm(one.force) for one in postures.found])
     return [[round(float(one), 5) + 0.0 for one in row] for row in orthonormal(FORCES.T @ forces)]
 

@@ -113,6 +113,35 @@ def test_a_board_that_stands_askew_gets_a_matrix(tmp_path: Path) -> None:
     assert math.degrees(off) < 1.0
 
 
+def test_a_wrong_unit_is_not_taken_for_axes(tmp_path: Path) -> None:
+    """Forces in g: the axes are right all the same. Rates in degrees: no axes fit."""
+    found = checked(recording(tmp_path / "g.dhil", by_board(postures(SEQUENCE), np.eye(3), np.eye(3) / 9.80665)))
+    assert found["head_axes"] == ["x", "y", "z"]
+    assert "specific force at rest is 0.102 g: is its unit m/s^2?" in found["verdict"]
+    short = checked(recording(tmp_path / "w.dhil", by_board(postures(SEQUENCE), np.eye(3) / 9, np.eye(3))), code=1)
+    assert (
+        "do not feel a turn that the accelerometers show" in short["verdict"] or "rests were found" in short["verdict"]
+    )
+
+
+def test_a_dtg_head_whatever_its_mounting_in_the_scenario(tmp_path: Path) -> None:
+    """Its own axes are looked at, those of the four gyro axes combined."""
+    swings = {name: {"sines": [{"amplitude": 40, "period_s": s}]} for name, s in (("heading", 3), ("pitch", 4))}
+    chosen = standing(axes=("y", "x", "-z"), lever_arm_m=(0, 0, 0)).with_changes(
+        motion={"rest_s": 0, "ramp_s": 0, **swings}
+    )
+    path = tmp_path / "head.dhil"
+    writer = RecordingWriter(path, {"scenario": chosen.model_dump(mode="json")})
+    for _, *parts in SimulatedHead(chosen).chunks(1200):
+        for part in parts:
+            writer.write(part)
+    writer.close()
+    found = checked(path)
+    assert found["motion"]["says"] == "as they should be"
+    assert found["motion"]["certain"]
+    assert found["motion"]["off_deg"] < 5.0
+
+
 def test_motion_alone_tells_whether_gyros_and_accelerometers_agree(tmp_path: Path) -> None:
     t = np.arange(15 * RATE_HZ) / RATE_HZ
     waved = increments(Rotation.from_euler("ZYX", np.sin(t[:, None] * [1.3, 1.7, 2.3]) * [0.8, 0.9, 1.0]))

@@ -93,7 +93,10 @@ def test_the_gyro_bias_of_a_board_at_rest_is_captured_at_the_start():
     outlets = Outlets.make(recording=False, readers=1)
     loop = Loop(LoopOrder(chosen, paced=False), outlets)
     loop.take(np.concatenate([emulator.slow(), emulator.samples(imu)]))
-    north, heading = 15.041067 * math.cos(math.radians(50.0)), math.radians(40.0)  # deg/h, of a level board at 50 deg north
+    north, heading = (
+        15.041067 * math.cos(math.radians(50.0)),
+        math.radians(40.0),
+    )  # deg/h, of a level board at 50 deg north
     earth = [north * math.cos(heading), -north * math.sin(heading), -15.041067 * math.sin(math.radians(50.0))]
     np.testing.assert_allclose(loop.result()["gyro_bias_deg_h"], 3600.0 * bias_deg_s - earth, atol=1e-3)
     rows = np.zeros(1, NAV_STATE)
