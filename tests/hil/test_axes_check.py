@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import hil
+from postures import RATE_HZ, SEQUENCE, increments, through
 from scipy.spatial.transform import Rotation
 
 from drivers import make_emulator
@@ -24,32 +25,7 @@ from nav.alignment.axes import SIGNED, matrix
 from nav.alignment.postures import ORDERS
 from nav.increments import ImuIncrements
 
-RATE_HZ, G = 100, 9.81
-SEQUENCE = [(0, 0, 0), (0, 90, 0), (0, 0, 0), (0, 0, 90), (0, 0, 0), (90, 0, 0)]
 FLIP_Y = np.diag([1.0, -1.0, 1.0])
-
-
-def increments(attitudes: Rotation) -> ImuIncrements:
-    """What a body senses that takes these attitudes one after the other, in its place."""
-    imu = ImuIncrements.empty(len(attitudes) - 1)
-    imu.step[:] = 1.0 / RATE_HZ
-    imu.time[:] = np.arange(1, len(attitudes)) / RATE_HZ
-    imu.sequence[:] = np.arange(len(imu))
-    turns = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
-    middle = attitudes[:-1] * Rotation.from_rotvec(0.5 * turns)
-    imu.dtheta[:], imu.dvel[:] = turns, middle.inv().apply([0.0, 0.0, -G]) / RATE_HZ
-    return imu
-
-
-def postures(ends: list[tuple[int, int, int]]) -> ImuIncrements:
-    """Rests of 2 s and smooth turns of 1.5 s between them."""
-    poses, part = Rotation.from_euler("ZYX", ends, degrees=True), np.linspace(0.0, 1.0, int(1.5 * RATE_HZ))[:, None]
-    parts = [Rotation.concatenate([poses[0]] * (2 * RATE_HZ))]
-    for k in range(1, len(ends)):
-        turn = (poses[k - 1].inv() * poses[k]).as_rotvec()
-        parts.append(poses[k - 1] * Rotation.from_rotvec(part * part * (3.0 - 2.0 * part) * turn))
-        parts.append(Rotation.concatenate([poses[k]] * (2 * RATE_HZ)))
-    return increments(Rotation.concatenate(parts))
 
 
 def by_board(imu: ImuIncrements, gyro: Any, accelerometer: Any) -> FrameArray:
@@ -76,7 +52,7 @@ def checked(path: Path, *more: object, code: int = 0) -> dict[str, Any]:
 @pytest.mark.parametrize("axes", [("x", "y", "z"), ("y", "x", "-z"), ("-z", "x", "-y"), ("-x", "-y", "z")])
 def test_the_line_for_the_scenario_is_found(tmp_path: Path, axes: tuple[str, ...]) -> None:
     turn = matrix(axes)
-    path = recording(tmp_path / "turned.dhil", by_board(postures(SEQUENCE), turn, turn))
+    path = recording(tmp_path / "turned.dhil", by_board(through(SEQUENCE), turn, turn))
     found = checked(path)
     assert found["rests"] == len(ORDERS)
     assert found["head_axes"] == list(axes)
@@ -98,7 +74,7 @@ def test_the_line_for_the_scenario_is_found(tmp_path: Path, axes: tuple[str, ...
 def test_what_no_mounting_mends_is_named(
     tmp_path: Path, gyro: Any, accelerometer: Any, said: str, gyro_says: str, accelerometer_says: str
 ) -> None:
-    found = checked(recording(tmp_path / "wrong.dhil", by_board(postures(SEQUENCE), gyro, accelerometer)), code=1)
+    found = checked(recording(tmp_path / "wrong.dhil", by_board(through(SEQUENCE), gyro, accelerometer)), code=1)
     assert said in found["verdict"]
     assert found["gyro"]["says"].startswith(gyro_says)
     assert found["accelerometer"]["says"].startswith(accelerometer_says)
@@ -108,17 +84,17 @@ def test_what_no_mounting_mends_is_named(
 def test_a_board_that_stands_askew_gets_a_matrix(tmp_path: Path) -> None:
     """The sequence is of the vehicle; the board in it is turned by 25 deg: the matrix puts it right to a degree."""
     turn = Rotation.from_euler("ZYX", [25, 5, -8], degrees=True).as_matrix()
-    found = checked(recording(tmp_path / "askew.dhil", by_board(postures(SEQUENCE), turn, turn)))
+    found = checked(recording(tmp_path / "askew.dhil", by_board(through(SEQUENCE), turn, turn)))
     off = Rotation.from_matrix(mounting(HeadConfig(mounting=found["head_mounting"])) @ turn.T).magnitude()
     assert math.degrees(off) < 1.0
 
 
 def test_a_wrong_unit_is_not_taken_for_axes(tmp_path: Path) -> None:
     """Forces in g: the axes are right all the same. Rates in degrees: no axes fit."""
-    found = checked(recording(tmp_path / "g.dhil", by_board(postures(SEQUENCE), np.eye(3), np.eye(3) / 9.80665)))
+    found = checked(recording(tmp_path / "g.dhil", by_board(through(SEQUENCE), np.eye(3), np.eye(3) / 9.80665)))
     assert found["head_axes"] == ["x", "y", "z"]
     assert "specific force at rest is 0.102 g: is its unit m/s^2?" in found["verdict"]
-    short = checked(recording(tmp_path / "w.dhil", by_board(postures(SEQUENCE), np.eye(3) / 9, np.eye(3))), code=1)
+    short = checked(recording(tmp_path / "w.dhil", by_board(through(SEQUENCE), np.eye(3) / 9, np.eye(3))), code=1)
     assert (
         "do not feel a turn that the accelerometers show" in short["verdict"] or "rests were found" in short["verdict"]
     )
@@ -150,7 +126,7 @@ def test_motion_alone_tells_whether_gyros_and_accelerometers_agree(tmp_path: Pat
     assert good["head_axes"] is None
     bad = checked(recording(tmp_path / "bad.dhil", by_board(waved, FLIP_Y, np.eye(3))), code=1)
     assert bad["verdict"].endswith("the gyros against the accelerometers: the sign of y is reversed")
-    still = checked(recording(tmp_path / "rest.dhil", by_board(postures(SEQUENCE[:1]), np.eye(3), np.eye(3))), code=1)
+    still = checked(recording(tmp_path / "rest.dhil", by_board(through(SEQUENCE[:1]), np.eye(3), np.eye(3))), code=1)
     assert "1 rests were found" in still["verdict"]
     assert "gravity turned too little" in still["verdict"]
 
@@ -158,7 +134,7 @@ def test_motion_alone_tells_whether_gyros_and_accelerometers_agree(tmp_path: Pat
 def test_a_user_is_led_through_the_sequence(monkeypatch: pytest.MonkeyPatch) -> None:
     """A board that does as it is told, ten times as fast as a hand."""
     url, turn = f"unix:axes-{time.monotonic_ns():x}", matrix(("-y", "x", "z"))
-    batch = by_board(postures(SEQUENCE), turn, turn)
+    batch = by_board(through(SEQUENCE), turn, turn)
     ended = threading.Event()
 
     def feed() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from postures import RATE_HZ, SEQUENCE, increments, through
 from scipy.spatial.transform import Rotation
 
 from nav.alignment.axes import ROTATIONS, SIGNED, gyro_fit, matrix, named, rotation, turned
@@ -13,36 +14,7 @@ from nav.alignment.postures import FORCES, ORDERS, Postures, judged
 from nav.errors import HilError
 from nav.increments import ImuIncrements
 
-G = 9.81
-RATE_HZ = 100
-# Heading, pitch, roll at the ends of smooth turns of 1.5 s each, with rests of 2 s between: the stated sequence.
-SEQUENCE = [(0, 0, 0), (0, 90, 0), (0, 0, 0), (0, 0, 90), (0, 0, 0), (90, 0, 0)]
 signed = st.integers(0, 47).map(lambda k: SIGNED[k])
-
-
-def increments(attitudes: Rotation, step: float) -> ImuIncrements:
-    """What a body senses that takes these attitudes (body to north-east-down) one after the other, in its place."""
-    imu = ImuIncrements.empty(len(attitudes) - 1)
-    imu.step[:] = step
-    imu.time[:] = step * np.arange(1, len(attitudes))
-    imu.sequence[:] = np.arange(len(imu))
-    turns = (attitudes[:-1].inv() * attitudes[1:]).as_rotvec()
-    middle = attitudes[:-1] * Rotation.from_rotvec(0.5 * turns)
-    imu.dtheta[:] = turns
-    imu.dvel[:] = step * middle.inv().apply([0.0, 0.0, -G])
-    return imu
-
-
-def through(ends: list[tuple[float, float, float]], rest_s: float = 2.0, turn_s: float = 1.5) -> ImuIncrements:
-    """Rests at attitudes (heading, pitch, roll, deg) and smooth turns between them."""
-    poses = Rotation.from_euler("ZYX", ends, degrees=True)
-    parts = [Rotation.concatenate([poses[0]] * int(rest_s * RATE_HZ))]
-    part = np.linspace(0.0, 1.0, int(turn_s * RATE_HZ))[:, None]
-    part = part * part * (3.0 - 2.0 * part)
-    for a, b in itertools.pairwise(poses):
-        parts.append(a * Rotation.from_rotvec(part * (a.inv() * b).as_rotvec()))
-        parts.append(Rotation.concatenate([b] * int(rest_s * RATE_HZ)))
-    return increments(Rotation.concatenate(parts), 1.0 / RATE_HZ)
 
 
 def sensed(imu: ImuIncrements, gyro, accelerometer, rng=None) -> ImuIncrements:
@@ -165,7 +137,7 @@ def waved(seed: int, still: tuple[int, ...] = ()) -> ImuIncrements:
     amplitude = rng.uniform(0.5, 1.2, 3)
     amplitude[list(still)] = 0.0
     angles = amplitude * np.sin(2.0 * np.pi * t[:, None] / rng.uniform(2.0, 5.0, 3) + rng.uniform(0.0, 6.0, 3))
-    return increments(Rotation.from_euler("ZYX", angles), 1.0 / RATE_HZ)
+    return increments(Rotation.from_euler("ZYX", angles))
 
 
 @pytest.mark.parametrize("k", range(0, 48, 5))
