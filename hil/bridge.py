@@ -136,7 +136,8 @@ class Loop:
         """Device time at which the first sample began."""
         self._withheld = 0
         self._combiner = HeadCombiner(head_model(scenario.head))
-        self._mounting = mounting(scenario.head) if any(scenario.head.mounting_deg) else None
+        turn = mounting(scenario.head)
+        self._mounting = None if (turn == np.eye(3)).all() else turn
         calibration = validated(scenario.head.calibration or NO_HEAD, "in the loop")
         self._calibrated = calibration.serial or None  # 0: of no particular head
         self._magnetometer = calibration.magnetometer

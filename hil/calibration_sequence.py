@@ -191,6 +191,8 @@ def simulate(
             table["head"] |= {
                 "errors_seed": seed,
                 "mounting_deg": (0, 0, 0),
+                "axes": None,
+                "mounting": None,
                 "lever_arm_m": (0, 0, 0),
                 "calibration": None,
             }

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from hil import cli_watch
 from nav.errors import HilError
 
 if TYPE_CHECKING:
@@ -22,6 +23,10 @@ COMMON_BUS = "unix:dtg-hil"
 """Where `hil imu` and `hil run --imu` meet when no bus is named."""
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+
+
+app.command()(cli_watch.check_axes)
+app.command()(cli_watch.monitor)
 
 
 class RunFailed(HilError):
@@ -112,7 +117,7 @@ def imu(
 
     chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
     chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
-    stop = _StopSignal()
+    stop = StopSignal()
     head = SimulatedHead(chosen)
     for lack in claim().lacking if realtime else ():
         _say(lack)
@@ -321,7 +326,7 @@ def record(
     from hil.decoder import record_bus
     from hil.scenario import load
 
-    stop = _StopSignal()
+    stop = StopSignal()
     chosen = load(scenario).with_changes(bus=bus)
     _report(record_bus(chosen, file, duration, lambda: stop.wanted), as_json=as_json)
 
@@ -417,7 +422,7 @@ def configure(
 
 @app.command()
 def doctor(
-    probe: Annotated[bool, typer.Option("--probe", help="Listen on every serial port for known boards.")] = False,
+    probe: Annotated[bool, typer.Option("--probe", help="Listen on CAN and serial ports for known boards.")] = False,
     as_json: Json = False,
 ) -> None:
     """Say what this machine can do, and the command that mends each lack."""
@@ -519,7 +524,7 @@ def _run(
     checks = [parse(text) for text in assertions or []]
     if junit is not None and not checks:
         raise HilError("--junit needs at least one --assert")
-    stop = _StopSignal()
+    stop = StopSignal()
     session = Session(order, feeder=feeder, record=record_to)
     with session, RunView(session) as view:
         while not (session.ready or stop.wanted):
@@ -550,7 +555,7 @@ def _run(
     return summary
 
 
-def _follow(session: "Session", stop: "_StopSignal", view: Any) -> None:
+def _follow(session: "Session", stop: "StopSignal", view: Any) -> None:
     while session.running:
         if stop.wanted:
             session.stop()
@@ -558,7 +563,7 @@ def _follow(session: "Session", stop: "_StopSignal", view: Any) -> None:
         session.wait(0.1)
 
 
-class _StopSignal:
+class StopSignal:
     """Ctrl-C or SIGTERM asks for a clean stop; a second one ends at once."""
 
     def __init__(self) -> None:

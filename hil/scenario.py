@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from hil.toml import parse_toml
+from nav.alignment.axes import matrix, rotation
 from nav.errors import HilError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -21,6 +22,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 PositiveVector = tuple[Positive, Positive, Positive]
+AxisName = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 class _Model(BaseModel):
@@ -114,6 +116,10 @@ class HeadConfig(_Model):
     serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
     mounting_deg: Vector = (0.0, 0.0, 0.0)
     """Heading, pitch, roll of the head's axes relative to the body."""
+    axes: tuple[AxisName, AxisName, AxisName] | None = None
+    """The same where they lie along those of the body: the head's axes that point forward, right and down."""
+    mounting: tuple[Vector, Vector, Vector] | None = None
+    """The same as a matrix: takes vectors in the head's axes to the body's."""
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """Place of the head in the body, forward-right-down of the navigated point."""
     instruments: Literal["ideal", "dtg"] = "ideal"
@@ -144,6 +150,22 @@ class HeadConfig(_Model):
             beside = folder / value
             return read(beside if beside.is_file() else Path(value)).as_table()
         return validated(value, "in the scenario").as_table()
+
+    @field_validator("axes", "mounting")
+    @classmethod
+    def _turns(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None:
+            try:
+                matrix(value) if info.field_name == "axes" else rotation(value)
+            except HilError as error:
+                raise ValueError(str(error)) from error
+        return value
+
+    @model_validator(mode="after")
+    def _mounted_once(self) -> Self:
+        if any(self.mounting_deg) + (self.axes is not None) + (self.mounting is not None) > 1:
+            raise ValueError("mounting_deg, axes and mounting say the same: give one of them")
+        return self
 
     @field_validator("rate_hz")
     @classmethod

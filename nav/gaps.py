@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nav.increments import FloatArray, ImuIncrements, Validity
+from nav.increments import FloatArray, ImuIncrements, Validity, joined
 from nav.kernel import kernel
 
 MAX_FILL = 4096
@@ -116,7 +116,7 @@ class GapFiller:
                 rows += len(fill)
             start = stop
         parts.append(imu.rows(start, len(imu)))
-        return _joined(parts), gaps
+        return joined(parts), gaps
 
     def _interpolated(
         self, imu: ImuIncrements, row: int, time: float, length: float, sequence: int, missing: int, bridged: bool
@@ -137,9 +137,3 @@ class GapFiller:
             np.full(count, mark, np.int64),
             numbers,
         )
-
-
-def _joined(parts: list[ImuIncrements]) -> ImuIncrements:
-    return ImuIncrements(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ImuIncrements.__dataclass_fields__)
-    )

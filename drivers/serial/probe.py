@@ -98,6 +98,11 @@ def probe(place: str, names: list[str] | None = None, listen_s: float = LISTEN_S
     return None
 
 
+def place_of(url: str) -> str:
+    """The device in the URL of a port."""
+    return url.partition(":")[2].rpartition(":")[0]
+
+
 def check_port(url: str, driver: str, patience_s: float = 1.0) -> str:
     """Listen before a run; a warning to print, empty when `driver` understands what comes.
 
@@ -107,7 +112,7 @@ def check_port(url: str, driver: str, patience_s: float = 1.0) -> str:
         The port cannot be opened, or another rate or driver is the right one: says which.
     """
     heard = listen(url, [driver], patience_s)
-    place = url.partition(":")[2].rpartition(":")[0]
+    place = place_of(url)
     if heard.driver or "://" in url:
         return ""
     found = probe(place)
