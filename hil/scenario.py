@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hil.wire_config import WireFault
 from nav.errors import HilError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -381,6 +382,8 @@ class Scenario(_Model):
     motion: MotionConfig = MotionConfig()
     head: HeadConfig = HeadConfig()
     aiding: AidingConfig = AidingConfig()
+    wire: tuple[WireFault, ...] = ()
+    """What becomes of the simulated head's frames on their way."""
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
 

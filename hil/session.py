@@ -276,7 +276,7 @@ class Session:
         """What the run showed, as `hil run --json` prints it; complete after the end."""
         stats = self.outlets.stats
         names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
-        more = ("restarts", "interpolated", "silences")
+        more = ("restarts", "frozen", "clock_steps", "interpolated", "silences")
         wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
         device_s = stats["covered_us"] * 1e-6
         result: dict[str, Any] = {"scenario": self.order.scenario.name}
@@ -294,6 +294,8 @@ class Session:
                     result.update(answers)
                 else:
                     result[name] = answers
+        if "wire" in result.get("feeder", {}):
+            result["wire"] = result["feeder"].pop("wire")
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
         if self.problems:
             result["problems"] = self.problems

@@ -35,6 +35,8 @@ _FIELDS = (
     "short",
     "version_errors",
     "restarts",
+    "frozen",
+    "clock_steps",
     "interpolated",
     "silences",
     "recorder_lost",

@@ -2,8 +2,10 @@
 
 What is dropped is counted (`drivers.Counters`). The order of samples is judged by the 32-bit counter and the device's
 clock: the next one or a later one is taken (what is missing counts as lost); one of the last 63 that was not seen yet
-comes late, one that was seen is a duplicate, both are dropped; anything else is a head that started anew. Device time is
-unwrapped from its 32 bits of microseconds. A sample after a gap covers one nominal period, not the gap.
+comes late, one that was seen is a duplicate, both are dropped; one whose counter stands still while its time goes on is
+dropped too; anything else is a head that started anew. Device time is unwrapped from its 32 bits of microseconds; where it
+jumps and the counter goes on, the clock was set, and time goes on with the counter. A sample after a gap covers one nominal
+period, not the gap.
 """
 
 from importlib.resources import files
@@ -49,7 +51,7 @@ _FD_SIGNALS = (
 # State of the tracker.
 _STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN = range(6)
 # Outcomes of the tracker.
-_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS = range(7)
+_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS, _FROZEN, _CLOCK_STEPS, _OUTCOMES = range(10)
 
 
 def head_database_text() -> str:
@@ -88,7 +90,13 @@ def _track(
             state[_SEQUENCE], state[_TIME_US] = counter, us
             state[_SEEN] = -1  # one from before the first was never counted as lost
             step_us = float(period)
-        elif delta > 0 and elapsed > 0:
+        elif delta == 0 and elapsed != 0:
+            outcome[_FROZEN] += 1
+            continue
+        elif delta > 0 and (elapsed > 0 or (delta < WINDOW and period > 0)):
+            if delta < WINDOW and period > 0 and (elapsed <= 0 or abs(elapsed - delta * period) > (1 + delta // 8) * period):
+                outcome[_CLOCK_STEPS] += 1
+                elapsed = int(delta * period)
             outcome[_LOST] += delta - 1
             state[_SEQUENCE] += delta
             state[_TIME_US] += elapsed
@@ -136,6 +144,13 @@ def _join(
             continue
         number = data[k, 1] & 0x0F
         bit = 1 << kind[k]
+        if state[0] < 0 and kind[k] == state[2]:  # the frame that completed the last sample, once more?
+            again = True
+            for i in range(8):
+                again = again and partial[kind[k], i] == data[k, i]
+            if again:
+                duplicates += 1
+                continue
         if number != state[0]:
             state[0], state[1] = number, 0
         if state[1] & bit:
@@ -155,7 +170,7 @@ def _join(
                     joined[n, j, i] = partial[j, i]
             last[n] = k
             n += 1
-            state[0], state[1] = -1, 0
+            state[0], state[1], state[2] = -1, 0, kind[k]
     return n, duplicates
 
 
@@ -182,9 +197,9 @@ class DtgHead:
         self._now = np.array([0.0, 0.0, *[np.nan] * 5])
         """What the slow frames have said so far."""
         self._state = np.zeros(6, np.int64)
-        self._outcome = np.zeros(7, np.int64)
+        self._outcome = np.zeros(_OUTCOMES, np.int64)
         self._partial = np.zeros((6, 8), np.uint8)
-        self._partial_state = np.array([-1, 0], np.int64)
+        self._partial_state = np.array([-1, 0, -1], np.int64)
         self._arrivals: IntArray = np.zeros(0, np.int64)
         self._room(1024)
 
@@ -266,7 +281,8 @@ class DtgHead:
             int(outcome[_LOST]),
             int(outcome[_LATE]),
         )
-        counters.restarts = int(outcome[_RESTARTS])
+        counters.restarts, counters.frozen = int(outcome[_RESTARTS]), int(outcome[_FROZEN])
+        counters.clock_steps = int(outcome[_CLOCK_STEPS])
         counters.duplicated += int(outcome[_DUPLICATED])
         counters.crc_errors += int(outcome[_CRC])
         counters.version_errors += int(outcome[_VERSION])
