@@ -21,7 +21,7 @@ from drivers.can.integrity import Protection, protection
 from drivers.can.samples import signed
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, IntArray, Validity
-from nav.kernel import kernel
+from nav.kernel import inline_kernel, kernel
 
 PROTOCOL = 1
 """Version of the message set that this driver reads."""
@@ -128,6 +128,14 @@ def _track(
     return n
 
 
+@inline_kernel
+def _is_same(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    same = True
+    for i in range(8):
+        same = same and one[i] == other[i]
+    return same
+
+
 @kernel
 def _join(
     kind: IntArray,
@@ -137,30 +145,23 @@ def _join(
     joined: NDArray[np.uint8],
     last: IntArray,
 ) -> tuple[int, int]:
-    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames)."""
+    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames).
+
+    A head sends them in rising order. One that comes behind a later one begins another sample with the same four bits of
+    counter: what is open lacks it, and would be completed with what is not its own.
+    """
     n = duplicates = 0
     for k in range(kind.shape[0]):
         if kind[k] < 0:
             continue
         number = data[k, 1] & 0x0F
         bit = 1 << kind[k]
-        if state[0] < 0 and kind[k] == state[2]:  # the frame that completed the last sample, once more?
-            again = True
-            for i in range(8):
-                again = again and partial[kind[k], i] == data[k, i]
-            if again:
-                duplicates += 1
-                continue
-        if number != state[0]:
+        is_held = state[1] & bit or (state[0] < 0 and kind[k] == state[2])  # also the one that completed the last sample
+        if is_held and (number == state[0] or state[0] < 0) and _is_same(partial[kind[k]], data[k]):
+            duplicates += 1
+            continue
+        if number != state[0] or state[1] >= bit:
             state[0], state[1] = number, 0
-        if state[1] & bit:
-            again = True
-            for i in range(8):
-                again = again and partial[kind[k], i] == data[k, i]
-            if again:
-                duplicates += 1
-                continue
-            state[1] = 0  # the same number a whole turn of it later: what was begun is never completed
         state[1] |= bit
         for i in range(8):
             partial[kind[k], i] = data[k, i]

@@ -47,27 +47,21 @@ class DeviceFaults:
             said[(counter >= first) & (counter < end)] = max(first - 1, 0)
         return said
 
-    def times(self, ends: IntArray) -> IntArray:
-        """What the head's clock shows at the device times `ends` (n,), us."""
+    def clock_errors(self, counter: IntArray) -> IntArray:
+        """How far the head's clock is ahead at the ends of the samples `counter` (n,), us."""
+        begins, ends = counter * self._period_us, (counter + 1) * self._period_us
         error = np.zeros(len(ends))
-        begins = ends - self._period_us
         for fault in self._faults:
             since = np.clip(ends - fault.at_s * 1e6, 0.0, (fault.end_s - fault.at_s) * 1e6)
             if fault.kind == "clock-drift":
                 error += 1e-6 * fault.drift_ppm * since
             if fault.kind == "clock-step":
                 error += 1e6 * fault.step_s * ((begins >= fault.at_s * 1e6) & (begins < fault.end_s * 1e6))
-        return ends + np.rint(error).astype(np.int64)
+        return np.rint(error).astype(np.int64)
 
     def is_frozen(self, counter: IntArray) -> NDArray[np.bool_]:
         """Which of the sample numbers (n,) say the number of another."""
         return self.numbers(counter) != counter
-
-    def clock_steps(self, samples: int) -> int:
-        """How often the clock has jumped before the end of so many samples."""
-        duration_s = (samples - 1) * self._period_us * 1e-6
-        edges = [(fault.at_s, fault.end_s) for fault in self._faults if fault.kind == "clock-step"]
-        return sum(0.0 < edge <= duration_s for edges_of_one in edges for edge in edges_of_one)
 
     def _frozen(self) -> Iterator[tuple[int, float]]:
         for fault in self._faults:
@@ -108,7 +102,7 @@ class Wire:
         self.device = DeviceFaults(scenario.wire, period_us)
         self._step, self._parts = period_us * 1e-6, frames_per_sample
         self._judged = scenario.driver == "dtg-head"
-        self._ledger = Ledger(frames_per_sample)
+        self._ledger = Ledger(frames_per_sample, period_us)
         self._injected, self._lost_by = Counter[str](), Counter[str]()
         self._held: _Traffic | None = None
         self._last_due, self._swapped, self.samples = 0.0, -2, 0
@@ -145,11 +139,13 @@ class Wire:
 
     def report(self) -> dict[str, object]:
         """What was done, by kind: frames (samples for reorder and counter-freeze); samples lost by it; what must be counted."""
-        steps = self.device.clock_steps(self.samples)
-        injected = self._injected + Counter({"clock-step": steps})
-        result: dict[str, object] = {"samples": self.samples, "injected": dict(injected), "lost": dict(self._lost_by)}
+        result: dict[str, object] = {
+            "samples": self.samples,
+            "injected": dict(+self._injected),
+            "lost": dict(+self._lost_by),
+        }
         if self._judged:
-            result["expected"] = {**self._ledger.as_dict(), "clock_steps": steps}
+            result["expected"] = self._ledger.as_dict()
         return result
 
     def _of(self, kind: str) -> Iterator[tuple[WireFault, np.random.Generator]]:
@@ -269,7 +265,7 @@ class Wire:
         ledger.crc_errors += int((~traffic.intact & (traffic.kind != _AIDING)).sum())
         good = traffic.intact & (traffic.kind == _SAMPLE)
         samples = traffic.sample[good]
-        for sample, part, frozen in zip(
-            samples.tolist(), traffic.part[good].tolist(), self.device.is_frozen(samples).tolist(), strict=True
-        ):
-            ledger.add_part(sample, part, frozen=frozen)
+        errors, frozen = self.device.clock_errors(samples), self.device.is_frozen(samples)
+        columns = (samples, traffic.part[good], errors, frozen)
+        for sample, part, error, still in zip(*(column.tolist() for column in columns), strict=True):
+            ledger.add_part(sample, part, error, frozen=still)

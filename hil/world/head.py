@@ -83,7 +83,7 @@ class SimulatedHead:
         ends = (counter + 1) * self.period_us
         said, shown = counter, ends
         if self.wire is not None:
-            said, shown = self.wire.device.numbers(counter), self.wire.device.times(ends)
+            said, shown = self.wire.device.numbers(counter), ends + self.wire.device.clock_errors(counter)
         if self._board is None:
             batch = self._encoder.samples(said, shown, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
         else:
