@@ -32,6 +32,7 @@ class RunView:
         self._last_s = 0.0
         self._plain_s = 0.0
         self._said_compiling = False
+        self._problems = 0
 
     def __enter__(self) -> "RunView":
         if self._terminal:
@@ -60,6 +61,9 @@ class RunView:
         """Print what happened."""
         for time, severity, text in self._session.events():
             self._console.print(f"[{_COLOURS.get(severity, 'white')}]{time:10.3f} s  {escape(text)}[/]")
+        for problem in self._session.problems[self._problems :]:
+            self._console.print(f"[{_COLOURS['error']}]{escape(problem)}[/]")
+            self._problems += 1
 
     def refresh(self, now_s: float) -> None:
         """Print events and renew the status line."""

@@ -51,12 +51,16 @@ class _Part:
     process: BaseProcess
     connection: Connection
     answers: _Answers = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    """What it has told at once, and nobody has taken yet."""
 
     def read(self) -> None:
         """Take what the process has answered."""
         with contextlib.suppress(EOFError, OSError):
             while self.connection.poll():
-                self.answers.update(self.connection.recv())
+                said = self.connection.recv()
+                self.problems += [said.pop("problem")] if self.name == "recorder" and "problem" in said else []
+                self.answers.update(said)
 
 
 class Session:
@@ -238,6 +242,8 @@ class Session:
     def _watch(self) -> None:
         for part in self._parts.values():
             part.read()
+            self.problems += part.problems
+            part.problems.clear()
             failed = part.answers.get("failed")
             died = part.process.exitcode not in (None, 0) and not failed
             if died:
@@ -271,6 +277,8 @@ class Session:
             if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
             part.read()
+            self.problems += part.problems
+            part.problems.clear()
 
     def summary(self) -> dict[str, Any]:
         """What the run showed, as `hil run --json` prints it; complete after the end."""

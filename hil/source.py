@@ -23,6 +23,14 @@ class Source(Protocol):
     exhausted: bool
     """Nothing more will come."""
 
+    @property
+    def trouble(self) -> str:
+        """Why nothing can come now, with what mends it; empty when all is well."""
+
+    @property
+    def overflowed(self) -> int:
+        """Frames that the kernel dropped because we did not take them in time."""
+
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """As `drivers.can.bus.Port.receive`."""
 
@@ -40,6 +48,16 @@ class BusSource:
         self.live = paced
         self.exhausted = False
         self._port = open_port(url, lossless=not paced)
+
+    @property
+    def trouble(self) -> str:
+        """See `Source.trouble`."""
+        return getattr(self._port, "trouble", "")
+
+    @property
+    def overflowed(self) -> int:
+        """See `Source.overflowed`."""
+        return getattr(self._port, "overflowed", 0)
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """See `Source.receive`."""
@@ -65,6 +83,9 @@ class FileSource:
     paced : bool
         Hand frames out at the times at which they were recorded; else as fast as they are asked for.
     """
+
+    trouble = ""
+    overflowed = 0
 
     def __init__(self, path: Path, *, paced: bool) -> None:
         self.live = False

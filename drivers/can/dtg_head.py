@@ -94,7 +94,11 @@ def _track(
             outcome[_FROZEN] += 1
             continue
         elif delta > 0 and (elapsed > 0 or (delta < WINDOW and period > 0)):
-            if delta < WINDOW and period > 0 and (elapsed <= 0 or abs(elapsed - delta * period) > (1 + delta // 8) * period):
+            if (
+                delta < WINDOW
+                and period > 0
+                and (elapsed <= 0 or abs(elapsed - delta * period) > (1 + delta // 8) * period)
+            ):
                 outcome[_CLOCK_STEPS] += 1
                 elapsed = int(delta * period)
             outcome[_LOST] += delta - 1
@@ -156,7 +160,9 @@ def _join(
             continue
         number = data[k, 1] & 0x0F
         bit = 1 << kind[k]
-        is_held = state[1] & bit or (state[0] < 0 and kind[k] == state[2])  # also the one that completed the last sample
+        is_held = state[1] & bit or (
+            state[0] < 0 and kind[k] == state[2]
+        )  # also the one that completed the last sample
         if is_held and (number == state[0] or state[0] < 0) and _is_same(partial[kind[k]], data[k]):
             duplicates += 1
             continue

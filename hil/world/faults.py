@@ -61,7 +61,8 @@ class DeviceFaults:
 
     def is_frozen(self, counter: IntArray) -> NDArray[np.bool_]:
         """Which of the sample numbers (n,) say the number of another."""
-        return self.numbers(counter) != counter
+        frozen: NDArray[np.bool_] = self.numbers(counter) != counter
+        return frozen
 
     def _frozen(self) -> Iterator[tuple[int, float]]:
         for fault in self._faults:
@@ -200,9 +201,7 @@ class Wire:
         traffic.intact[hit] = False
         return traffic
 
-    def _change(
-        self, fault: WireFault, rng: np.random.Generator, traffic: _Traffic, first: int, end: int
-    ) -> _Traffic:
+    def _change(self, fault: WireFault, rng: np.random.Generator, traffic: _Traffic, first: int, end: int) -> _Traffic:
         """Send frames twice, later or in another order, or others among them; none is lost."""
         hit = self._within(fault, traffic)
         times = np.arange(first, end) * self._step + 1e-9
@@ -240,7 +239,7 @@ class Wire:
         self._injected["babble"] += n
         whole = np.ones(n, np.bool_)
         own = np.full(n, _FOREIGN)
-        due = (sample + 1) * self._step
+        due: FloatArray = np.asarray((sample + 1) * self._step)
         return _Traffic(batch, own, sample, np.zeros(n, np.int64), due, sample.astype(float), whole).with_more(traffic)
 
     def _out(self, traffic: _Traffic) -> Iterator[tuple[float, FrameArray]]:

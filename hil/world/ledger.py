@@ -54,7 +54,9 @@ class Ledger:
             self._note_clock(sample - self._highest, clock_us)
             self._highest = sample
             self.samples += 1
-            self._seen = {one for one in self._seen if one > sample - KEPT} if len(self._seen) > 2 * KEPT else self._seen
+            self._seen = (
+                {one for one in self._seen if one > sample - KEPT} if len(self._seen) > 2 * KEPT else self._seen
+            )
             self._seen.add(sample)
         elif sample in self._seen or sample < self._first:  # one from before the first was never missed
             self.duplicated += 1
