@@ -38,6 +38,8 @@ BUS = {
     "tx_timeout": "the CAN controller cannot send",
     "transceiver": "the CAN transceiver reports a fault of the wires",
 }
+_FIRST = 2
+"""The counters before this one are those of good frames and samples."""
 _SEVERE = {"bus_off": "error", "restarted": "notice"}
 
 
@@ -61,8 +63,8 @@ class WireWatch:
     """Looks at the counters of a driver after each batch; `bus` is the URL, for the commands that mend."""
 
     def __init__(self, counters: Counters, bus: str) -> None:
-        self._counters, self._names = counters, list(counters.as_dict())
-        self._before, self._faults = counters.as_list(), dict[str, _Fault]()
+        self._counters, self._names = counters, list(counters.as_dict())[_FIRST:]
+        self._before, self._faults = counters.as_list()[_FIRST:], dict[str, _Fault]()
         kind, _, place = bus.partition("?")[0].partition(":")
         self._interface = place if kind == "socketcan" else "can0"
         self.errors = BusErrors()
@@ -70,9 +72,9 @@ class WireWatch:
 
     def look(self, batch: FrameArray, counts: list[int], now_s: float) -> Iterator[Said]:
         """What is new with the counters `counts` after `batch`, at the device time `now_s`."""
-        if counts != self._before:
-            before, self._before = dict(zip(self._names, self._before, strict=True)), counts
-            for name, count in zip(self._names, counts, strict=True):
+        if counts[_FIRST:] != self._before:
+            before, self._before = dict(zip(self._names, self._before, strict=True)), counts[_FIRST:]
+            for name, count in zip(self._names, self._before, strict=True):
                 errors = int(is_error(batch).sum()) if name == "foreign" else 0
                 if name in FRAMES and count > before[name] + errors:
                     yield from self._shown(name, before[name], now_s, Said("warning", f"{name}: {FRAMES[name]}"))
