@@ -3,6 +3,8 @@
 #   make run   [ARGS="--duration 10"]   the bridge with its built-in scenario
 #   make test  [ARGS="-k ring"]         all tests, those on real SocketCAN included
 #   make studies                        the studies of several minutes, whole
+#   make reliability                    every fault once, measured; writes docs/reliability.md
+#   make soak  [MINUTES=30]             1 kHz with random faults: accounting, recording and memory are checked at the end
 #   make lint                           ruff, mypy, import rules
 #   make dev                            .venv with everything that a developer needs
 #   make vcan                           install what the SocketCAN tests need on a kernel without CAN (Debian, root or sudo)
@@ -11,8 +13,9 @@
 SHELL := /bin/bash
 PYTHON ?= python3
 ARGS ?=
+MINUTES ?= 30
 
-.PHONY: run test studies lint dev vcan clean
+.PHONY: run test studies reliability soak lint dev vcan clean
 .DELETE_ON_ERROR:
 
 run: .venv/.installed-run
@@ -23,6 +26,12 @@ test: .venv/.installed-test
 
 studies: .venv/.installed-test
 	@.venv/bin/python -m pytest -m study $(ARGS)
+
+reliability: .venv/.installed-test
+	@tools/reliability.sh
+
+soak: .venv/.installed-run
+	@tools/soak.sh $(MINUTES) $(ARGS)
 
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .
