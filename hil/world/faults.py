@@ -85,6 +85,10 @@ class _Traffic:
     place: FloatArray
     """Order in which they go out."""
     intact: NDArray[np.bool_]
+    frozen: NDArray[np.bool_]
+    """The sample says the number of another."""
+    clock_us: IntArray
+    """Error of its time."""
 
     def chosen(self, index: NDArray[np.bool_] | IntArray) -> "_Traffic":
         return _Traffic(*(getattr(self, column.name)[index] for column in fields(self)))
@@ -105,8 +109,12 @@ class Wire:
         self._judged = scenario.driver == "dtg-head"
         self._ledger = Ledger(frames_per_sample, period_us)
         self._injected, self._lost_by = Counter[str](), Counter[str]()
+        self._fates: dict[int, str] = {}
+        """What has become of the lost samples of the chunk that goes out."""
         self._held: _Traffic | None = None
-        self._last_due, self._swapped, self.samples = 0.0, -2, 0
+        self._last_due, self._swapped = 0.0, -2
+        self.samples = 0
+        """Samples whose time has come."""
 
     def take(self, first: int, slow: FrameArray, batch: FrameArray) -> Iterator[tuple[float, FrameArray]]:
         """What goes out of a chunk of `SimulatedHead.chunks`: (when it is due, s; frames), in order.
@@ -115,17 +123,17 @@ class Wire:
         """
         traffic = self._traffic(first, slow, batch)
         end = int(traffic.sample[-1]) + 1
-        self.samples = end
-        frozen = self.device.is_frozen(np.arange(first, end))
-        fate = np.where(frozen, "counter-freeze", "").astype(object)
-        self._lost_by.update(fate[frozen].tolist())
-        self._injected["counter-freeze"] += int(frozen.sum())
+        self._lost_by.update(self._fates.values())
+        frozen = np.unique(traffic.sample[traffic.frozen & (traffic.kind == _SAMPLE)]).tolist()
+        self._fates = dict.fromkeys(frozen, "counter-freeze")
+        self._injected["counter-freeze"] += len(frozen)
+        now = [one for one in self._faults if one[0].at_s < end * self._step and one[0].end_s > first * self._step]
         for kind in ("drop", "bit-flip", "crc-off", "silence"):
-            for fault, rng in self._of(kind):
-                traffic = self._lose(fault, rng, traffic, fate, first)
+            for fault, rng in now:
+                traffic = self._lose(fault, rng, traffic) if fault.kind == kind else traffic
         for kind in ("duplicate", "reorder", "delay", "jitter", "babble"):
-            for fault, rng in self._of(kind):
-                traffic = self._change(fault, rng, traffic, first, end)
+            for fault, rng in now:
+                traffic = self._change(fault, rng, traffic, first, end) if fault.kind == kind else traffic
         if self._held is not None:
             traffic = self._held.with_more(traffic)
         ripe = traffic.place < end
@@ -140,22 +148,17 @@ class Wire:
 
     def report(self) -> dict[str, object]:
         """What was done, by kind: frames (samples for reorder and counter-freeze); samples lost by it; what must be counted."""
-        result: dict[str, object] = {
-            "samples": self.samples,
-            "injected": dict(+self._injected),
-            "lost": dict(+self._lost_by),
-        }
+        lost = self._lost_by + Counter(kind for sample, kind in self._fates.items() if sample < self.samples)
+        result: dict[str, object] = {"samples": self.samples, "injected": dict(+self._injected), "lost": dict(+lost)}
         if self._judged:
             result["expected"] = self._ledger.as_dict()
         return result
-
-    def _of(self, kind: str) -> Iterator[tuple[WireFault, np.random.Generator]]:
-        return ((fault, rng) for fault, rng in self._faults if fault.kind == kind)
 
     def _traffic(self, first: int, slow: FrameArray, batch: FrameArray) -> _Traffic:
         aiding, many = is_aiding(batch["can_id"]), len(slow)
         number = np.maximum(np.cumsum(~aiding) - 1, 0)
         sample = first + np.concatenate([np.zeros(many, np.int64), number // self._parts])
+        samples = np.arange(first, int(sample[-1]) + 1)
         return _Traffic(
             frames=np.concatenate([slow, batch]),
             kind=np.concatenate([np.full(many, _SLOW), np.where(aiding, _AIDING, _SAMPLE)]),
@@ -164,6 +167,8 @@ class Wire:
             due=(sample + 1) * self._step,
             place=sample.astype(float),
             intact=np.ones(len(sample), np.bool_),
+            frozen=self.device.is_frozen(samples)[sample - first],
+            clock_us=self.device.clock_errors(samples)[sample - first],
         )
 
     def _within(self, fault: WireFault, traffic: _Traffic) -> NDArray[np.bool_]:
@@ -171,9 +176,7 @@ class Wire:
         within: NDArray[np.bool_] = (begins >= fault.at_s) & (begins < fault.end_s)
         return within
 
-    def _lose(
-        self, fault: WireFault, rng: np.random.Generator, traffic: _Traffic, fate: NDArray[np.object_], first: int
-    ) -> _Traffic:
+    def _lose(self, fault: WireFault, rng: np.random.Generator, traffic: _Traffic) -> _Traffic:
         """Take frames out or damage them, and note what became of their samples."""
         hit = self._within(fault, traffic)
         draws = rng.random((int(hit.sum()), 2))
@@ -191,11 +194,9 @@ class Wire:
             data[rows, 0] = 0
             data[rows[wide], 1] = 0
         self._injected[fault.kind] += int(hit.sum())
-        dead = np.unique(traffic.sample[hit & (traffic.kind == _SAMPLE)]) - first
-        dead = dead[fate[dead] == ""]
         if self._judged or fault.kind != "bit-flip":  # a board without a check does not see the damage
-            fate[dead] = fault.kind
-            self._lost_by[fault.kind] += len(dead)
+            for sample in np.unique(traffic.sample[hit & (traffic.kind == _SAMPLE)]).tolist():
+                self._fates.setdefault(sample, fault.kind)
         if fault.kind in {"drop", "silence"}:
             return traffic.chosen(~hit)
         traffic.intact[hit] = False
@@ -240,7 +241,9 @@ class Wire:
         whole = np.ones(n, np.bool_)
         own = np.full(n, _FOREIGN)
         due: FloatArray = np.asarray((sample + 1) * self._step)
-        return _Traffic(batch, own, sample, np.zeros(n, np.int64), due, sample.astype(float), whole).with_more(traffic)
+        zeros = np.zeros(n, np.int64)
+        other = _Traffic(batch, own, sample, zeros, due, sample.astype(float), whole, zeros != 0, zeros)
+        return other.with_more(traffic)
 
     def _out(self, traffic: _Traffic) -> Iterator[tuple[float, FrameArray]]:
         traffic = traffic.chosen(np.argsort(traffic.place, kind="stable"))
@@ -251,20 +254,20 @@ class Wire:
         stamped = traffic.frames["time_ns"] > 0
         late_ns = np.rint((due - (traffic.sample + 1) * self._step) * 1e9).astype(np.int64)
         traffic.frames["time_ns"][stamped] += late_ns[stamped]
-        cuts = [0, *(np.flatnonzero(np.diff(due)) + 1).tolist(), len(due)]
-        for start, end in pairwise(cuts):
-            piece = traffic.chosen(np.arange(start, end))
-            yield float(due[start]), piece.frames
-            self._enter(piece)
+        columns = (traffic.kind, traffic.sample, traffic.part, traffic.intact, traffic.frozen, traffic.clock_us)
+        rows = list(zip(*(column.tolist() for column in columns), strict=True))
+        for start, end in pairwise([0, *(np.flatnonzero(np.diff(due)) + 1).tolist(), len(due)]):
+            yield float(due[start]), traffic.frames[start:end]
+            for row in rows[start:end]:
+                self._enter(*row)
 
-    def _enter(self, traffic: _Traffic) -> None:
+    def _enter(self, kind: int, sample: int, part: int, intact: bool, frozen: bool, clock_us: int) -> None:
         ledger = self._ledger
-        ledger.frames += len(traffic.frames)
-        ledger.foreign += int((traffic.kind == _FOREIGN).sum())
-        ledger.crc_errors += int((~traffic.intact & (traffic.kind != _AIDING)).sum())
-        good = traffic.intact & (traffic.kind == _SAMPLE)
-        samples = traffic.sample[good]
-        errors, frozen = self.device.clock_errors(samples), self.device.is_frozen(samples)
-        columns = (samples, traffic.part[good], errors, frozen)
-        for sample, part, error, still in zip(*(column.tolist() for column in columns), strict=True):
-            ledger.add_part(sample, part, error, frozen=still)
+        self.samples = max(self.samples, sample + 1)
+        ledger.frames += 1
+        if kind == _FOREIGN:
+            ledger.foreign += 1
+        elif not intact:
+            ledger.crc_errors += kind != _AIDING
+        elif kind == _SAMPLE:
+            ledger.add_part(sample, part, clock_us, frozen=frozen)
