@@ -135,6 +135,12 @@ def print_summary(summary: dict[str, Any]) -> None:
         sigma = summary["estimate"]["sigma"]
         own = f"{sigma['position_m']:.3g} m, {sigma['velocity_ms']:.3g} m/s, {sigma['attitude_deg']:.3g} deg"
         table.add_row("own sigma at the end", own)
+    if summary["frozen"] or summary["clock_steps"]:
+        table.add_row("frozen counter, clock steps", f"{summary['frozen']}, {summary['clock_steps']}")
+    if "bus_errors" in summary:
+        table.add_row("CAN controller", ", ".join(f"{name} {count}" for name, count in summary["bus_errors"].items()))
+    if "overflowed" in summary:
+        table.add_row("frames dropped by the kernel", str(summary["overflowed"]))
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")

@@ -3,9 +3,9 @@
 # Linux) stop it.
 set -eu
 cd "$(dirname "$0")/.."
-export HIL_RELIABILITY=$PWD/build/reliability NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/build/numba}
+export HIL_RELIABILITY=$PWD/build/reliability
 rm -rf "$HIL_RELIABILITY"
-mkdir -p "$HIL_RELIABILITY" "$NUMBA_CACHE_DIR"
+mkdir -p "$HIL_RELIABILITY"
 pytest=(.venv/bin/python -m pytest -q)
 "${pytest[@]}" -m "not socketcan" tests/e2e/test_reliability*.py
 guest=(tools/with_vcan.sh -t 1200 --)

@@ -6,7 +6,6 @@ memory of no process grew. Exit code 1 says which of these failed.
 """
 
 import argparse
-import contextlib
 import json
 import os
 import sys
@@ -58,10 +57,8 @@ def drawn(seed: int, duration_s: float) -> list[dict[str, Any]]:
 
 def resident_kib(pid: int) -> float:
     """Resident memory of a process that is its own: without what it shares with others."""
-    with contextlib.suppress(OSError, ValueError):
-        resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[1:3]
-        return (int(resident) - int(shared)) * PAGE_KIB
-    return float("nan")
+    resident, shared = Path(f"/proc/{pid}/statm").read_text().split()[1:3]
+    return (int(resident) - int(shared)) * PAGE_KIB
 
 
 def slope_kib_min(times: list[float], sizes: list[float]) -> float:
@@ -93,7 +90,8 @@ def flown(
         while session.running:
             now = time.monotonic()
             for name, part in session._parts.items():
-                memory.setdefault(name, []).append((now - began, resident_kib(part.process.pid or 0)))
+                if part.process.is_alive() and part.process.pid:
+                    memory.setdefault(name, []).append((now - began, resident_kib(part.process.pid)))
             session.events()
             if now - said > 60.0:
                 said = now
@@ -155,6 +153,7 @@ def main() -> int:
         wire=drawn(chosen.seed, duration_s),
         head={"rate_hz": chosen.rate, "layout": chosen.layout, "instruments": "ideal"},
         navigation={"alignment": "truth", "gap_realign_s": 100.0},
+        mavlink={"links": ("udpout:127.0.0.1:24560",)},
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "soak.dhil"

@@ -9,6 +9,4 @@ if [[ " $* " == *" --bus "* ]] || ip link show up vcan0 2>/dev/null | grep -q vc
   exec "${soak[@]}"
 fi
 echo "soak: this kernel has no vcan0: it runs in user-mode Linux (make vcan installs it)" >&2
-export NUMBA_CACHE_DIR=${NUMBA_CACHE_DIR:-$PWD/build/numba}
-mkdir -p "$NUMBA_CACHE_DIR"
-exec tools/with_vcan.sh -t $((minutes * 120 + 900)) -- "${soak[@]}"
+exec tools/with_vcan.sh -t $((${minutes%.*} * 120 + 1200)) -- "${soak[@]}"

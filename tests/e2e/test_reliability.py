@@ -42,6 +42,7 @@ SAYS = {
     "clock-drift": "the head's clock runs at `drift_ppm`",
     "silence": "nothing comes",
 }
+UNITS = {"delay_s": " s", "step_s": " s", "drift_ppm": " ppm"}
 FLIGHT = """
 name = "reliability"
 [motion]
@@ -95,7 +96,7 @@ def injected(kind: str) -> str:
     keys = {key: value for key, value in FAULTS[kind].items() if key != "for_s"}
     said = SAYS[kind]
     for key, value in keys.items():
-        said = said.replace(f"`{key}`", f"{value:g} {key.partition('_')[2]}" if "_" in key else f"{100 * value:g} %")
+        said = said.replace(f"`{key}`", f"{value:g}{UNITS.get(key, '')}" if "_" in key else f"{100 * value:g} %")
     return f"{said}, for {FAULTS[kind]['for_s']:g} s"
 
 
