@@ -4,6 +4,8 @@
 #   make test  [ARGS="-k ring"]         all tests, those on real SocketCAN included
 #   make studies                        the studies of several minutes, whole
 #   make fuzz  [TARGET="blf sbg"] [RUNS=1000000] [SECONDS=600]  atheris on the parsers, for hours; writes docs/fuzzing.md
+#   make reliability                    every fault once, measured; writes docs/reliability.md
+#   make soak  [MINUTES=30]             1 kHz with random faults: accounting, recording and memory are checked at the end
 #   make lint                           ruff, mypy, import rules
 #   make dev                            .venv with everything that a developer needs
 #   make vcan                           install what the SocketCAN tests need on a kernel without CAN (Debian, root or sudo)
@@ -12,8 +14,9 @@
 SHELL := /bin/bash
 PYTHON ?= python3
 ARGS ?=
+MINUTES ?= 30
 
-.PHONY: run test studies fuzz lint dev vcan clean
+.PHONY: run test studies fuzz reliability soak lint dev vcan clean
 .DELETE_ON_ERROR:
 
 run: .venv/.installed-run
@@ -27,6 +30,12 @@ studies: .venv/.installed-test
 
 fuzz: .venv/.installed-fuzz
 	@.venv/bin/python tests/fuzz/run.py --runs $(or $(RUNS),1000000) --seconds $(or $(SECONDS),0) $(TARGET)
+
+reliability: .venv/.installed-test
+	@tools/reliability.sh
+
+soak: .venv/.installed-run
+	@tools/soak.sh $(MINUTES) $(ARGS)
 
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .

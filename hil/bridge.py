@@ -39,6 +39,7 @@ from hil.settings import settings_of
 from hil.source import BusSource, FileSource, Source
 from hil.stats import Phase, Stats, Times
 from hil.warmup import warm_loop
+from hil.wire_watch import WireWatch
 from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
 from nav.aiding import Kind
@@ -129,6 +130,7 @@ class Loop:
         """The scenario's duration is over."""
         self.samples = 0
         """Navigated so far."""
+        self._watch = WireWatch(self.driver.counters, scenario.bus)
         self._aiding = AidingDecoder()
         self._now: float | None = None
         """Device time of the newest sample."""
@@ -199,7 +201,7 @@ class Loop:
         driver = self.driver
         raw = driver.decode(batch)
         if len(raw) == 0:
-            self._count()
+            self._count(batch)
             return False
         self._now = float(raw.time[-1])
         if self._first is None:
@@ -213,7 +215,7 @@ class Loop:
             self._clock.reset()
             self._started = None
         self._pass(raw.rows(start, len(raw)), arrivals[start:])
-        self._count()
+        self._count(batch)
         return True
 
     def _pass(self, raw: HeadIncrements | ImuIncrements, arrivals: IntArray) -> None:
@@ -320,10 +322,7 @@ class Loop:
         outlets.states.push(rows)
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
-            note = np.zeros(1, EVENTS)
-            note["time"], note["severity"], note["station"] = event.time, event.severity.encode(), event.station
-            note["text"] = event.text.encode()[:240]
-            outlets.events.push(note)
+            self._note(event.time, event.severity, event.text, event.station)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
             if self._truth.position.count:
@@ -331,11 +330,24 @@ class Loop:
         if self._trace is not None:
             self._trace.add(rows)
 
-    def _count(self) -> None:
+    def _count(self, batch: FrameArray) -> None:
         counters = self.driver.counters
-        self._outlets.stats.set_block("frames", counters.as_list())
+        counts = counters.as_list()
+        self._outlets.stats.set_block("frames", counts)
         self._outlets.stats["samples"] = self.samples  # not those of the last batch that lie beyond the duration
         self._outlets.control.set_loss(counters.lost, self.samples)
+        for said in self._watch.look(batch, counts, self._now or 0.0):
+            self.say(said.severity, said.text, station=said.station)
+
+    def say(self, severity: str, text: str, *, station: bool = False) -> None:
+        """Tell the user something that is not of the navigator's."""
+        self._note(self._now or 0.0, severity, text, station)
+
+    def _note(self, time_s: float, severity: str, text: str, station: bool) -> None:
+        note = np.zeros(1, EVENTS)
+        note["time"], note["severity"], note["station"] = time_s, severity.encode(), station
+        note["text"] = text.encode()[:240]
+        self._outlets.events.push(note)
 
     def result(self) -> dict[str, Any]:
         """What the summary needs beyond the shared counters."""
@@ -347,6 +359,8 @@ class Loop:
             "failed_axes": self._combiner.failed(),
             "aiding": {kind.name: count for kind, count in self._aiding.heard.items() if count},
         }
+        if errors := self._watch.errors.as_dict():
+            result["bus_errors"] = errors
         if self._withheld:
             result["withheld"] = self._withheld
         if self._aiding.counters.frames:
@@ -422,10 +436,14 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     heard: int | None = None
     stats, control = outlets.stats, outlets.control
     relayed, relayed_number = frames(BATCH), 0
+    trouble = ""
     while not (control.stop or loop.finished or source.exhausted):
         n = source.receive(batch, wait)
         now = time.monotonic_ns()
         stats["beat_ns"] = now
+        if source.trouble != trouble:
+            trouble = source.trouble
+            loop.say("error" if trouble else "notice", trouble or f"{order.scenario.bus} is back", station=True)
         if n:
             taken, samples = batch[:n], loop.samples
             if source.live:

@@ -328,7 +328,7 @@ def record(
 
     stop = StopSignal()
     chosen = load(scenario).with_changes(bus=bus)
-    _report(record_bus(chosen, file, duration, lambda: stop.wanted), as_json=as_json)
+    _report(record_bus(chosen, file, duration, lambda: stop.wanted, _say), as_json=as_json)
 
 
 @app.command()

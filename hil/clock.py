@@ -96,7 +96,7 @@ def clock_reading(stats: Stats) -> ClockReading | None:
         stats["clock_offset_ns"],
         stats["clock_drift_e12"] * 1e-6,
         bound_ns * 1e-3,
-        stats["clock_steps"] + stats["host_steps"],
+        stats["device_steps"] + stats["host_steps"],
     )
 
 
@@ -109,6 +109,6 @@ def clock_summary(stats: Stats) -> dict[str, Any] | None:
         "offset_s": None if reading is None else reading.offset_ns * 1e-9,
         "drift_ppm": None if reading is None else reading.drift_ppm,
         "bound_us": None if reading is None else reading.bound_us,
-        "steps": stats["clock_steps"],
+        "steps": stats["device_steps"],
         "host_steps": stats["host_steps"],
     }

@@ -33,6 +33,7 @@ class RunView:
         self._last_s = 0.0
         self._plain_s = 0.0
         self._said_compiling = False
+        self._problems = 0
 
     def __enter__(self) -> "RunView":
         if self._terminal:
@@ -61,6 +62,9 @@ class RunView:
         """Print what happened."""
         for time, severity, text in self._session.events():
             self._console.print(f"[{_COLOURS.get(severity, 'white')}]{time:10.3f} s  {escape(text)}[/]")
+        for problem in self._session.problems[self._problems :]:
+            self._console.print(f"[{_COLOURS['error']}]{escape(problem)}[/]")
+            self._problems += 1
 
     def refresh(self, now_s: float) -> None:
         """Print events and renew the status line."""
@@ -137,6 +141,12 @@ def print_summary(summary: dict[str, Any]) -> None:
         sigma = summary["estimate"]["sigma"]
         own = f"{sigma['position_m']:.3g} m, {sigma['velocity_ms']:.3g} m/s, {sigma['attitude_deg']:.3g} deg"
         table.add_row("own sigma at the end", own)
+    if summary["frozen"] or summary["clock_steps"]:
+        table.add_row("frozen counter, clock steps", f"{summary['frozen']}, {summary['clock_steps']}")
+    if "bus_errors" in summary:
+        table.add_row("CAN controller", ", ".join(f"{name} {count}" for name, count in summary["bus_errors"].items()))
+    if "overflowed" in summary:
+        table.add_row("frames dropped by the kernel", str(summary["overflowed"]))
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")

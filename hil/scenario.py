@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from hil.toml import parse_toml
+from hil.wire_config import WireFault
 from nav.alignment.axes import matrix, rotation
 from nav.errors import HilError
 
@@ -403,6 +404,8 @@ class Scenario(_Model):
     motion: MotionConfig = MotionConfig()
     head: HeadConfig = HeadConfig()
     aiding: AidingConfig = AidingConfig()
+    wire: tuple[WireFault, ...] = ()
+    """What becomes of the simulated head's frames on their way."""
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
 

@@ -55,12 +55,16 @@ class _Part:
     process: BaseProcess
     connection: Connection
     answers: _Answers = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    """What it has told at once, and nobody has taken yet."""
 
     def read(self) -> None:
         """Take what the process has answered."""
         with contextlib.suppress(EOFError, OSError):
             while self.connection.poll():
-                self.answers.update(self.connection.recv())
+                said = self.connection.recv()
+                self.problems += [said.pop("problem")] if self.name == "recorder" and "problem" in said else []
+                self.answers.update(said)
 
 
 class Session:
@@ -254,6 +258,8 @@ class Session:
     def _watch(self) -> None:
         for part in self._parts.values():
             part.read()
+            self.problems += part.problems
+            part.problems.clear()
             failed = part.answers.get("failed")
             died = part.process.exitcode not in (None, 0) and not failed
             if died:
@@ -312,12 +318,14 @@ class Session:
             if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
             part.read()
+            self.problems += part.problems
+            part.problems.clear()
 
     def summary(self) -> dict[str, Any]:
         """What the run showed, as `hil run --json` prints it; complete after the end."""
         stats = self.outlets.stats
         names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
-        more = ("restarts", "interpolated", "silences", "overruns")
+        more = ("restarts", "frozen", "clock_steps", "interpolated", "silences", "overruns")
         wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
         device_s = stats["covered_us"] * 1e-6
         result: dict[str, Any] = {"scenario": self.order.scenario.name}
@@ -340,6 +348,8 @@ class Session:
                     result.update(answers)
                 else:
                     result[name] = answers
+        if "wire" in result.get("feeder", {}):
+            result["wire"] = result["feeder"].pop("wire")
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
         if self.problems:
             result["problems"] = self.problems

@@ -27,15 +27,19 @@ class Source(Protocol):
     exhausted: bool
     """Nothing more will come."""
 
+    @property
+    def trouble(self) -> str:
+        """Why nothing can come now, with what mends it; empty when all is well."""
+
+    @property
+    def overflowed(self) -> int:
+        """Frames that the kernel dropped because we did not take them in time."""
+
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """As `drivers.can.bus.Port.receive`."""
 
     def close(self) -> None:
         """Let go."""
-
-    @property
-    def overflowed(self) -> int:
-        """Frames that were lost before they could be taken, because a buffer was full."""
 
     def problem(self) -> str:
         """What went wrong with the source, in a line; empty when nothing."""
@@ -48,6 +52,11 @@ class BusSource:
         self.live = paced
         self.exhausted = False
         self._port = open_port(url, lossless=not paced)
+
+    @property
+    def trouble(self) -> str:
+        """See `Source.trouble`."""
+        return getattr(self._port, "trouble", "")
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """See `Source.receive`."""
@@ -85,6 +94,7 @@ class FileSource:
         Hand frames out at the times at which they were recorded; else as fast as they are asked for.
     """
 
+    trouble = ""
     overflowed = 0
 
     def __init__(self, path: Path, *, paced: bool) -> None:

@@ -39,6 +39,8 @@ _FIELDS = (
     "short",
     "version_errors",
     "restarts",
+    "frozen",
+    "clock_steps",
     "interpolated",
     "silences",
     "recorder_lost",
@@ -47,7 +49,7 @@ _FIELDS = (
     "clock_offset_ns",  # host (clock of the day) less device
     "clock_drift_e12",  # of the device against the host, 1e-12
     "clock_bound_ns",  # NO_SAMPLE, NO_BOUND
-    "clock_steps",
+    "device_steps",
     "host_steps",
     "position_error_mm",  # -1: no truth
     "covered_us",  # device time from the first sample on, all lives of the device together

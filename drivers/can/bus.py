@@ -86,6 +86,8 @@ class PythonCanPort:
         self.url = url
         self.dropped = 0
         self.failures = 0
+        self.trouble = ""
+        """Why it cannot be used now."""
         self._arguments = {"interface": interface, "channel": channel, **options}
         if interface in {"socketcan", "virtual"}:
             self._arguments.setdefault("fd", True)
@@ -106,6 +108,7 @@ class PythonCanPort:
 
     def _failed(self) -> None:
         self.failures += 1
+        self.trouble = f"bus {self.url}: the interface failed"
         if self._bus is not None:
             with contextlib.suppress(Exception):
                 self._bus.shutdown()
@@ -116,7 +119,9 @@ class PythonCanPort:
         if self._bus is None and time.monotonic() >= self._retry:
             try:
                 self._bus = self._open()
-            except HilError:
+                self.trouble = ""
+            except HilError as error:
+                self.trouble = str(error)
                 self._retry = time.monotonic() + REOPEN_S
         return self._bus
 

@@ -2,8 +2,10 @@
 
 What is dropped is counted (`drivers.Counters`). The order of samples is judged by the 32-bit counter and the device's
 clock: the next one or a later one is taken (what is missing counts as lost); one of the last 63 that was not seen yet
-comes late, one that was seen is a duplicate, both are dropped; anything else is a head that started anew. Device time is
-unwrapped from its 32 bits of microseconds. A sample after a gap covers one nominal period, not the gap.
+comes late, one that was seen is a duplicate, both are dropped; one whose counter stands still while its time goes on is
+dropped too; anything else is a head that started anew. Device time is unwrapped from its 32 bits of microseconds; where it
+jumps and the counter goes on, the clock was set, and time goes on with the counter. A sample after a gap covers one nominal
+period, not the gap.
 """
 
 from functools import cache
@@ -20,7 +22,7 @@ from drivers.can.integrity import Protection, protection
 from drivers.can.samples import signed
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, IntArray, Validity
-from nav.kernel import kernel
+from nav.kernel import inline_kernel, kernel
 
 PROTOCOL = 1
 """Version of the message set that this driver reads."""
@@ -50,7 +52,7 @@ _FD_SIGNALS = (
 # State of the tracker.
 _STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN = range(6)
 # Outcomes of the tracker.
-_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS = range(7)
+_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS, _FROZEN, _CLOCK_STEPS, _OUTCOMES = range(10)
 
 
 def head_database_text() -> str:
@@ -95,7 +97,17 @@ def _track(
             state[_SEQUENCE], state[_TIME_US] = counter, us
             state[_SEEN] = -1  # one from before the first was never counted as lost
             step_us = float(period)
-        elif delta > 0 and elapsed > 0:
+        elif delta == 0 and elapsed != 0:
+            outcome[_FROZEN] += 1
+            continue
+        elif delta > 0 and (elapsed > 0 or (delta < WINDOW and period > 0)):
+            if (
+                delta < WINDOW
+                and period > 0
+                and (elapsed <= 0 or abs(elapsed - delta * period) > (1 + delta // 8) * period)
+            ):
+                outcome[_CLOCK_STEPS] += 1
+                elapsed = int(delta * period)
             outcome[_LOST] += delta - 1
             state[_SEQUENCE] += delta
             state[_TIME_US] += elapsed
@@ -125,6 +137,14 @@ def _track(
         n += 1
     outcome[_SAMPLES] += n
     return n
+
+
+@inline_kernel
+def _is_same(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    same = True
+    for i in range(8):
+        same = same and one[i] == other[i]
+    return same
 
 
 @kernel
@@ -192,23 +212,25 @@ def _join(
     joined: NDArray[np.uint8],
     last: IntArray,
 ) -> tuple[int, int]:
-    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames)."""
+    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames).
+
+    A head sends them in rising order. One that comes behind a later one begins another sample with the same four bits of
+    counter: what is open lacks it, and would be completed with what is not its own.
+    """
     n = duplicates = 0
     for k in range(kind.shape[0]):
         if kind[k] < 0:
             continue
         number = data[k, 1] & 0x0F
         bit = 1 << kind[k]
-        if number != state[0]:
+        is_held = state[1] & bit or (
+            state[0] < 0 and kind[k] == state[2]
+        )  # also the one that completed the last sample
+        if is_held and (number == state[0] or state[0] < 0) and _is_same(partial[kind[k]], data[k]):
+            duplicates += 1
+            continue
+        if number != state[0] or state[1] >= bit:
             state[0], state[1] = number, 0
-        if state[1] & bit:
-            again = True
-            for i in range(8):
-                again = again and partial[kind[k], i] == data[k, i]
-            if again:
-                duplicates += 1
-                continue
-            state[1] = 0  # the same number a whole turn of it later: what was begun is never completed
         state[1] |= bit
         for i in range(8):
             partial[kind[k], i] = data[k, i]
@@ -218,7 +240,7 @@ def _join(
                     joined[n, j, i] = partial[j, i]
             last[n] = k
             n += 1
-            state[0], state[1] = -1, 0
+            state[0], state[1], state[2] = -1, 0, kind[k]
     return n, duplicates
 
 
@@ -245,9 +267,9 @@ class DtgHead:
         self._now = np.array([0.0, 0.0, *[np.nan] * 5])
         """What the slow frames have said so far."""
         self._state = np.zeros(6, np.int64)
-        self._outcome = np.zeros(7, np.int64)
+        self._outcome = np.zeros(_OUTCOMES, np.int64)
         self._partial = np.zeros((6, 8), np.uint8)
-        self._partial_state = np.array([-1, 0], np.int64)
+        self._partial_state = np.array([-1, 0, -1], np.int64)
         self._arrivals: IntArray = np.zeros(0, np.int64)
         self._room(1024)
 
@@ -311,7 +333,8 @@ class DtgHead:
             int(outcome[_LOST]),
             int(outcome[_LATE]),
         )
-        counters.restarts = int(outcome[_RESTARTS])
+        counters.restarts, counters.frozen = int(outcome[_RESTARTS]), int(outcome[_FROZEN])
+        counters.clock_steps = int(outcome[_CLOCK_STEPS])
         counters.duplicated += int(outcome[_DUPLICATED])
         counters.crc_errors += int(outcome[_CRC])
         counters.version_errors += int(outcome[_VERSION])

@@ -99,6 +99,8 @@ class SocketCanPort:
         """Frames that the kernel dropped because our buffer was full."""
         self.failures = 0
         """Times the interface failed."""
+        self.trouble = ""
+        """Why it cannot be used now, with the command that mends it."""
         self._overflow_base = 0
         self._clock = AdapterClock()
         self._retry = 0.0
@@ -149,8 +151,9 @@ class SocketCanPort:
         self._overflow_base = self.overflowed
         return sock
 
-    def _failed(self) -> None:
+    def _failed(self, code: int) -> None:
         self.failures += 1
+        self.trouble = explain(self.interface, OSError(code, os.strerror(code)))
         if self._socket is not None:
             self._socket.close()
         self._socket = None
@@ -160,7 +163,9 @@ class SocketCanPort:
         if self._socket is None and time.monotonic() >= self._retry:
             try:
                 self._socket = self._open()
-            except HilError:
+                self.trouble = ""
+            except HilError as error:
+                self.trouble = str(error)
                 self._retry = time.monotonic() + REOPEN_S
         return self._socket
 
@@ -192,7 +197,7 @@ class SocketCanPort:
         if got <= 0:
             code = ctypes.get_errno() if got < 0 else 0
             if code not in {0, errno.EAGAIN, errno.EINTR}:
-                self._failed()
+                self._failed(code)
             return 0
         taken, control = self._frames[:got], self._control[:got]
         kernel, adapter = control["seconds"] * _SECOND + control["nanoseconds"], control["stamps"][:, 2]
@@ -225,7 +230,7 @@ class SocketCanPort:
                     time.sleep(0.001)
                     continue
                 if error.errno in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO}:
-                    self._failed()
+                    self._failed(error.errno)
                 break
         self.dropped += 1
 

@@ -1,10 +1,12 @@
 """Our own recording: every frame as it came in, with its time, and the events that the navigation depends on.
 
 Layout: the magic line, a header (length, CRC-32, JSON), then blocks of whole `FRAME` records, each block with its count
-and CRC-32. A block is written at least every `FLUSH_S`, so that a killed process loses no more than that. A record whose
-``reserved[0]`` is `EVENT` is no frame but an event of the loop, in its place among the frames.
+and CRC-32. A block is written at least every `FLUSH_S`, so that a killed process loses no more than that. A block that the
+disk does not take is taken back whole: what was recorded before stays readable, and recording goes on when there is room. A
+record whose ``reserved[0]`` is `EVENT` is no frame but an event of the loop, in its place among the frames.
 """
 
+import contextlib
 import json
 import struct
 import time
@@ -60,18 +62,22 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, header: dict[str, Any]) -> None:
+        self.path = path
+        text = json.dumps(header).encode()
         try:
-            self._file: BinaryIO = path.open("wb")
+            self._file = path.open("wb", buffering=0)
+            self._end = self._put(MAGIC + _HEAD.pack(len(text), zlib.crc32(text)) + text)
         except OSError as error:
             raise HilError(f"recording {path}: {error.strerror}") from error
-        text = json.dumps(header).encode()
-        self._file.write(MAGIC + _HEAD.pack(len(text), zlib.crc32(text)) + text)
-        self._file.flush()
         self._block = frames(BLOCK)
         self._filled = 0
         self._flushed = time.monotonic()
         self.written = 0
         """Records written."""
+        self.lost = 0
+        """Records that the disk did not take."""
+        self.problem = ""
+        """Why the disk does not take what comes now; empty while it does."""
 
     def write(self, batch: FrameArray) -> None:
         """Append `batch`; flushes by count and by time."""
@@ -89,12 +95,27 @@ class RecordingWriter:
     def flush(self) -> None:
         """Write what is buffered as one block."""
         self._flushed = time.monotonic()
-        if self._filled:
-            data = self._block[: self._filled].tobytes()
-            self._file.write(_BLOCK_HEAD.pack(b"BLK1", self._filled, zlib.crc32(data)) + data)
-            self._file.flush()
-            self.written += self._filled
-            self._filled = 0
+        count, self._filled = self._filled, 0
+        if not count:
+            return
+        data = self._block[:count].tobytes()
+        try:
+            self._end += self._put(_BLOCK_HEAD.pack(b"BLK1", count, zlib.crc32(data)) + data)
+            self.written += count
+            self.problem = ""
+        except OSError as error:
+            self.lost += count
+            self.problem = f"recording {self.path}: {error.strerror}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._end)
+            self._file.seek(self._end)
+
+    def _put(self, data: bytes) -> int:
+        """Write all of `data`; its length."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        return len(data)
 
     def close(self) -> None:
         """Flush and close."""
