@@ -427,9 +427,11 @@ class Scenario(_Model):
     def world_id(self) -> int:
         """A 32-bit fingerprint of what the simulated head does: motion, head and seed; never 0.
 
-        The simulated head announces it, so that a bridge elsewhere knows whether its own truth applies.
+        The simulated head announces it, so that a bridge elsewhere knows whether its own truth applies. Keys at their default
+        do not count, so that a new key changes no fingerprint of a recording.
         """
-        world = self.model_dump(mode="json", include={"motion", "head", "seed"}, exclude={"head": {"calibration"}})
+        kept = {"motion", "head", "seed"}
+        world = self.model_dump(mode="json", include=kept, exclude={"head": {"calibration"}}, exclude_defaults=True)
         return zlib.crc32(json.dumps(world, sort_keys=True).encode()) or 1
 
 
