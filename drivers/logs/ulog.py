@@ -61,7 +61,7 @@ def read_ulog(path: Path) -> ImuLog:
     except Exception as error:  # pyulog raises whatever the bytes provoke
         raise HilError(f"log {path}: not a readable ULog: {error}") from error
     topics = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    said = {name: float(log.initial_parameters.get(name, value)) for name, value in _DEFAULTS.items()}
+    said = {name: _stated(log.initial_parameters.get(name), value) for name, value in _DEFAULTS.items()}
     try:
         for name in ("sensor_combined", "vehicle_attitude"):
             if (name, 0) not in topics or len(topics[name, 0]["timestamp"]) < 2:
@@ -80,6 +80,11 @@ def read_ulog(path: Path) -> ImuLog:
         raise HilError(f"log {path}: a topic lacks its column {error}") from error
     except HilError as error:
         raise HilError(f"log {path}: {error}") from error
+
+
+def _stated(value: object, default: float) -> float:
+    """A parameter of the log, the default where it is no number."""
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else default
 
 
 def _times(data: _Data) -> IntArray:
