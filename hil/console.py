@@ -131,6 +131,12 @@ def print_summary(summary: dict[str, Any]) -> None:
         sigma = summary["estimate"]["sigma"]
         own = f"{sigma['position_m']:.3g} m, {sigma['velocity_ms']:.3g} m/s, {sigma['attitude_deg']:.3g} deg"
         table.add_row("own sigma at the end", own)
+    for receiver in summary.get("receivers", []):
+        refused = ", ".join(f"{count} {reason}" for reason, count in receiver.get("refused", {}).items())
+        fixes = (
+            f"{receiver.get('fixes', 0)} fixes by {receiver.get('speaks') or 'nothing'}; refused: {refused or 'none'}"
+        )
+        table.add_row(f"receiver at {escape(receiver.get('port', '?'))}", fixes)
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")

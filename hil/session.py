@@ -1,6 +1,7 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
     feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, this process
+                                receivers --rings--^
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
 """
@@ -21,6 +22,7 @@ import numpy as np
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.control import run_part
 from hil.publisher import Taps, run_publisher
+from hil.receiver import run_receiver
 from hil.recorder import run_recorder
 from hil.ring import Wake
 from hil.stats import Phase
@@ -84,7 +86,8 @@ class Session:
         publish: bool = True,
     ) -> None:
         self.order = order
-        self.outlets = Outlets.make(recording=record is not None, readers=1)
+        self._receivers = {f"receiver {k}": one for k, one in enumerate(order.scenario.receiver if order.live else ())}
+        self.outlets = Outlets.make(recording=record is not None, readers=1, receivers=len(self._receivers))
         self._feeder = feeder
         self._record = record
         self._publish = publish
@@ -138,10 +141,11 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            live = self.order.paced and self.order.file is None
-            network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
+            network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
+        for k, (name, config) in enumerate(self._receivers.items()):
+            launch(name, run_receiver, config, k, outlets.states, outlets.aiding[1 + k], outlets.control)
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -254,7 +258,7 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher"):
+        for name in ("loop", "feeder", "recorder", "publisher", *self._receivers):
             part = self._parts.get(name)
             if part is None:
                 continue
@@ -272,6 +276,11 @@ class Session:
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
             part.read()
 
+    def _answers(self, name: str) -> _Answers:
+        part = self._parts[name]
+        part.read()
+        return {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
+
     def summary(self) -> dict[str, Any]:
         """What the run showed, as `hil run --json` prints it; complete after the end."""
         stats = self.outlets.stats
@@ -286,17 +295,18 @@ class Session:
         result["speed"] = device_s / wall if wall else 0.0
         result["latency_us"] = stats.latency_us()
         for name in ("loop", "feeder", "publisher", "recorder"):
-            part = self._parts.get(name)
-            if part is not None:
-                part.read()
-                answers = {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
+            if name in self._parts:
+                answers = self._answers(name)
                 if name == "loop":
                     result.update(answers)
                 else:
                     result[name] = answers
+        if self._receivers:
+            result["receivers"] = [self._answers(name) for name in self._receivers]
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
-        if self.problems:
-            result["problems"] = self.problems
+        told = [one["problem"] for one in result.get("receivers", []) if "problem" in one]
+        if self.problems or told:
+            result["problems"] = self.problems + told
         return result
 
 

@@ -1,0 +1,188 @@
+"""A receiver of satellite navigation at a port of its own: a process that hands its fixes to the loop, as frames in a ring.
+
+A fix has the device time of the inertial sensor at which it was true. On the host's clock that is its arrival, less the delay of
+the scenario, and less what it came late beyond the fastest one by the receiver's own time. From the host's clock to the device's
+the newest samples lead: both steps take the fastest transport seen for a constant one.
+"""
+
+import contextlib
+import math
+import signal
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+
+from drivers.can.aiding import AidingArray, AidingEncoder
+from drivers.can.frames import frames
+from drivers.clock import ClockMap
+from drivers.serial.fixes import Fix, Stated
+from drivers.serial.port import SerialPort
+from drivers.serial.receiver import Receiver
+from hil.control import Control
+from hil.geoid import undulation
+from hil.ring import Ring
+from hil.scenario import ReceiverConfig
+from nav.aiding import AT_PORTS, Kind, aiding_rows
+from nav.errors import HilError
+from nav.state import NAV_STATE
+
+WAIT_S = 0.1
+"""Longest wait for bytes: how soon an order to stop is seen."""
+BROKEN_S = 1.0
+"""A receiver whose time departs by more from the host's, from one fix to the next, has set its clock."""
+
+
+@dataclass(slots=True)
+class FixClock:
+    """Arrivals of fixes on the host's clock, without what they came late.
+
+    Attributes
+    ----------
+    offset_s : float
+        Host clock less UTC by the receiver, s: the smallest seen, with the delay of the fastest fix in it; NaN before a fix.
+    late_s : float
+        The most that a fix came late beyond that, s.
+    steps : int
+        Times that the receiver's clock, or the host's, was set.
+    """
+
+    offset_s: float = math.nan
+    late_s: float = 0.0
+    steps: int = 0
+    _map: ClockMap = field(default_factory=ClockMap)
+    _last_s: float = math.nan
+
+    def arrival_ns(self, fix: Fix) -> int:
+        """When `fix` would have arrived by the fastest way, ns."""
+        if fix.utc_s is None:
+            return fix.arrival_ns
+        offset_s = 1e-9 * fix.arrival_ns - fix.utc_s
+        if abs(offset_s - self._last_s) > BROKEN_S:
+            self.steps += 1
+            self._map.reset()
+            self.offset_s = math.nan
+        self._last_s = offset_s
+        self.offset_s = min(offset_s, self.offset_s) if math.isfinite(self.offset_s) else offset_s
+        late_s = self._map.update(fix.utc_s, fix.arrival_ns)
+        self.late_s = max(self.late_s, late_s)
+        return fix.arrival_ns - round(1e9 * late_s)
+
+
+class DeviceClock:
+    """Device time of a host time, by the newest solutions."""
+
+    def __init__(self, states: Ring) -> None:
+        self._states, self._map, self._row = states, ClockMap(), np.zeros(1, NAV_STATE)
+        self._time = math.nan
+
+    def look(self) -> None:
+        """Take the newest solution."""
+        if not self._states.latest(self._row):
+            return
+        time_s, arrival_ns = float(self._row["time"][0]), int(self._row["arrival_ns"][0])
+        if time_s < self._time:  # the sensor was started anew
+            self._map.reset()
+        if time_s != self._time:
+            self._map.update(time_s, arrival_ns)
+            self._time = time_s
+
+    def device_s(self, host_ns: int) -> float:
+        """Device time at `host_ns`, s; NaN before the first solution."""
+        if math.isnan(self._time):
+            return math.nan
+        return self._time + 1e-9 * (host_ns - self._map.host_ns(self._time))
+
+
+class Relay:
+    """Fixes of receiver `number` into `ring`, and what is counted."""
+
+    def __init__(self, config: ReceiverConfig, number: int, states: Ring, ring: Ring) -> None:
+        stated = Stated(config.range_error_m, config.speed_error_ms, math.radians(config.heading_error_deg))
+        offset = math.radians(config.heading_offset_deg)
+        self.receiver = Receiver(config.protocol, undulation, stated, offset)
+        self._delay_ns, self._source, self._ring = round(1e9 * config.delay_s), AT_PORTS + number, ring
+        self._clock, self._device, self._encoder = FixClock(), DeviceClock(states), AidingEncoder()
+        self.sent = 0
+
+    def warm_up(self) -> None:
+        """Load the kernels before the first fix."""
+        AidingEncoder().frames(aiding_rows([0.0], Kind.GNSS, np.zeros(6), np.ones(6), self._source))
+        undulation(0.0, 0.0)
+
+    def take(self, batch: Any) -> None:
+        """Send on the fixes that `batch` completes."""
+        self._device.look()
+        for fix in self.receiver.take(batch):
+            host_ns = self._clock.arrival_ns(fix) - self._delay_ns
+            if fix.refused:
+                continue
+            device_s = self._device.device_s(host_ns)
+            if not device_s >= 0.0:
+                self.receiver.refused["no inertial sample yet"] += 1
+                continue
+            fix.rows["time"], fix.rows["source"] = device_s, self._source
+            self._send(fix.rows)
+
+    def _send(self, rows: AidingArray) -> None:
+        try:
+            batch = self._encoder.frames(rows)
+        except HilError:  # it does not fit the wire to the loop
+            self.receiver.refused["out of range"] += 1
+            return
+        batch["time_ns"] = time.time_ns()
+        self._ring.push(batch)
+        self.sent += len(rows)
+
+    def report(self, port: SerialPort) -> dict[str, Any]:
+        """For the summary."""
+        receiver, clock = self.receiver, self._clock
+        stream = receiver.stream
+        result: dict[str, Any] = {
+            "port": port.url,
+            "speaks": receiver.speaks,
+            "fixes": receiver.fixes,
+            "sent": self.sent,
+            "refused": dict(receiver.refused),
+            "packets": stream.packets,
+            "foreign": receiver.foreign,
+            "crc_errors": stream.bad_checks,
+            "skipped_bytes": stream.skipped,
+            "host_minus_utc_s": clock.offset_s if math.isfinite(clock.offset_s) else None,
+            "late_s": clock.late_s,
+            "clock_steps": clock.steps,
+        }
+        if port.failures:
+            result["problem"] = f"{port.url} was lost {port.failures} times"
+        elif not stream.packets:
+            heard = stream.skipped + stream.waiting
+            came = (
+                f"{heard} bytes came and no packet was among them: is the baud rate right?" if heard else "nothing came"
+            )
+            result["problem"] = f"{port.url}: {came}"
+        return result
+
+
+def run_receiver(
+    config: ReceiverConfig, number: int, states: Ring, ring: Ring, control: Control, report: Connection
+) -> None:
+    """Relay the fixes of a receiver until `control` says stop; target of a spawned process.
+
+    Sends through `report` a dictionary: what was counted, or ``{"failed": message}`` where the port cannot be opened.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        relay = Relay(config, number, states, ring)
+        relay.warm_up()
+        with contextlib.closing(SerialPort(config.port)) as port:
+            batch = frames(256)
+            while not control.stop:
+                n = port.receive(batch, WAIT_S)
+                relay.take(batch[:n])
+            report.send(relay.report(port))
+    except HilError as error:
+        report.send({"failed": str(error)})
+    finally:
+        report.close()
