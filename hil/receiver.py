@@ -35,6 +35,10 @@ BROKEN_S = 1.0
 """A receiver whose time departs by more from the host's, from one fix to the next, has set its clock."""
 
 
+SETTLE_NS = 2_000_000_000
+"""So long fixes only show how far their clock is from the host's: the first may have come late, and nobody could tell."""
+
+
 @dataclass(slots=True)
 class FixClock:
     """Arrivals of fixes on the host's clock, without what they came late.
@@ -54,16 +58,21 @@ class FixClock:
     steps: int = 0
     _map: ClockMap = field(default_factory=ClockMap)
     _last_s: float = math.nan
+    _begun_ns: int = 0
+
+    def settled(self, fix: Fix) -> bool:
+        """Whether a fix that has been taken is of use; one without a time of its own always is."""
+        return fix.utc_s is None or fix.arrival_ns - self._begun_ns >= SETTLE_NS
 
     def arrival_ns(self, fix: Fix) -> int:
         """When `fix` would have arrived by the fastest way, ns."""
         if fix.utc_s is None:
             return fix.arrival_ns
         offset_s = 1e-9 * fix.arrival_ns - fix.utc_s
-        if abs(offset_s - self._last_s) > BROKEN_S:
-            self.steps += 1
+        if not abs(offset_s - self._last_s) <= BROKEN_S:
+            self.steps += math.isfinite(self._last_s)
             self._map.reset()
-            self.offset_s = math.nan
+            self.offset_s, self._begun_ns = math.nan, fix.arrival_ns
         self._last_s = offset_s
         self.offset_s = min(offset_s, self.offset_s) if math.isfinite(self.offset_s) else offset_s
         late_s = self._map.update(fix.utc_s, fix.arrival_ns)
@@ -120,8 +129,9 @@ class Relay:
             if fix.refused:
                 continue
             device_s = self._device.device_s(host_ns)
-            if not device_s >= 0.0:
-                self.receiver.refused["no inertial sample yet"] += 1
+            if not (device_s >= 0.0 and self._clock.settled(fix)):
+                why = "clock settles" if device_s >= 0.0 else "no inertial sample yet"
+                self.receiver.refused[why] += 1
                 continue
             fix.rows["time"], fix.rows["source"] = device_s, self._source
             self._send(fix.rows)
@@ -170,7 +180,8 @@ def run_receiver(
 ) -> None:
     """Relay the fixes of a receiver until `control` says stop; target of a spawned process.
 
-    Sends through `report` a dictionary: what was counted, or ``{"failed": message}`` where the port cannot be opened.
+    Sends through `report` dictionaries: ``ready`` when it listens, and at the end what was counted; or ``{"failed": message}``
+    where the port cannot be opened.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -178,6 +189,7 @@ def run_receiver(
         relay.warm_up()
         with contextlib.closing(SerialPort(config.port)) as port:
             batch = frames(256)
+            report.send({"ready": True})
             while not control.stop:
                 n = port.receive(batch, WAIT_S)
                 relay.take(batch[:n])

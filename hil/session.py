@@ -119,7 +119,8 @@ class Session:
     def _start(self) -> None:
         scenario, outlets = self.order.scenario, self.outlets
         context = mp.get_context("forkserver")
-        context.set_forkserver_preload(["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"])
+        preload = ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
+        context.set_forkserver_preload([*preload, "hil.receiver"] if self._receivers else preload)
 
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
@@ -163,8 +164,8 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
-        recorder = self._parts.get("recorder")
-        if self.outlets.stats["phase"] == Phase.STARTING or (recorder and "ready" not in recorder.answers):
+        heralds = [part for name, part in self._parts.items() if name == "recorder" or name in self._receivers]
+        if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in heralds):
             return False
         if not self.outlets.control.go:
             self._began = time.monotonic()

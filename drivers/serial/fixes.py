@@ -1,7 +1,8 @@
 """What receivers of satellite navigation have in common: epochs out of messages, and the fix that an epoch is.
 
-An epoch is all messages of one time. It is complete with the message that was the last one of the epoch before, so that nothing
-waits for the next epoch; where that message is missing, the next epoch ends it.
+An epoch is all messages of one time. It is complete with the message that is the last one of an epoch by experience, so that
+nothing waits for the next epoch; where that message is missing, the next epoch ends it. Two in a row with another last message
+change the experience, one is damage.
 """
 
 from collections.abc import Sequence
@@ -80,6 +81,7 @@ class Epochs:
     def __init__(self) -> None:
         self._epoch: Epoch | None = None
         self._last = ""
+        self._others = 0
 
     def add(self, key: object, name: str, message: Any, arrival_ns: int) -> list[Epoch]:
         """The epochs that a message ends; a `key` of None is that of the epoch at hand."""
@@ -88,7 +90,7 @@ class Epochs:
             if key is None:
                 return []
             if epoch is not None:
-                self._last = next(reversed(epoch.parts))
+                self._learn(next(reversed(epoch.parts)))
                 if not epoch.done:
                     ended.append(epoch)
             epoch = self._epoch = Epoch(key, arrival_ns, {})
@@ -98,6 +100,11 @@ class Epochs:
             epoch.done = True
             ended.append(epoch)
         return ended
+
+    def _learn(self, last: str) -> None:
+        self._others = self._others + 1 if last != self._last else 0
+        if self._others > 1 or not self._last:
+            self._last, self._others = last, 0
 
 
 def fix_of(epoch: Epoch, utc: datetime | None, rows: Sequence[Any], refused: str = "") -> Fix:

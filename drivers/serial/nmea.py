@@ -8,7 +8,7 @@ heading at all. The velocity is level. Source: NMEA 0183 as published by the mak
 import math
 import re
 from collections.abc import Callable
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, time, timedelta
 from typing import Any
 
 from pynmeagps import VALNONE, NMEAReader
@@ -63,6 +63,7 @@ class Nmea:
 
     def __init__(self, geoid: Undulation, stated: Stated, heading_offset: float = 0.0) -> None:
         self._epochs, self._geoid, self._stated, self._offset = Epochs(), geoid, stated, heading_offset
+        self._utc: datetime | None = None
 
     def read(self, packet: bytes, arrival_ns: int) -> list[Fix] | None:
         """The fixes that a good sentence completes; None for one without a fix.
@@ -88,7 +89,7 @@ class Nmea:
     def _fix(self, epoch: Epoch) -> Fix:
         parts = epoch.parts
         try:
-            utc = _utc(epoch)
+            utc = self._time(epoch)
             rows = [self._position(parts)]
         except Refused as refusal:
             return fix_of(epoch, None, [], str(refusal))
@@ -96,6 +97,17 @@ class Nmea:
             heading = math.remainder(math.radians(turned) - self._offset, 2.0 * math.pi)
             rows.append(aiding(0.0, Kind.HEADING, (heading,), (self._stated.heading,)))
         return fix_of(epoch, utc, rows)
+
+    def _time(self, epoch: Epoch) -> datetime | None:
+        """UTC of an epoch; one that does not say the day has that next to the epoch before."""
+        day, clock, before = _day(epoch.parts), epoch.key, self._utc
+        assert isinstance(clock, time)
+        if day is None and before is not None:
+            near = [datetime.combine(before.date() + timedelta(days=k), clock, UTC) for k in (-1, 0, 1)]
+            self._utc = min(near, key=lambda utc: abs(utc - before))
+        else:
+            self._utc = None if day is None else datetime.combine(day, clock, UTC)
+        return self._utc
 
     def _position(self, parts: dict[str, Any]) -> Any:
         gga, gst = parts["GGA"], parts.get("GST")
@@ -134,18 +146,16 @@ class Nmea:
         return (speed * KNOT * math.cos(angle), speed * KNOT * math.sin(angle)), self._stated.speed_ms
 
 
-def _utc(epoch: Epoch) -> datetime | None:
-    rmc, zda = epoch.parts.get("RMC"), epoch.parts.get("ZDA")
-    day = None
+def _day(parts: dict[str, Any]) -> date | None:
+    rmc, zda = parts.get("RMC"), parts.get("ZDA")
     if rmc is not None and rmc.status == "A" and isinstance(rmc.date, date):
-        day = rmc.date
-    elif zda is not None and all(map(_is_number, (zda.year, zda.month, zda.day))):
+        return rmc.date
+    if zda is not None and all(map(_is_number, (zda.year, zda.month, zda.day))):
         try:
-            day = date(zda.year, zda.month, zda.day)
+            return date(zda.year, zda.month, zda.day)
         except ValueError as error:
             raise Refused("unreadable") from error
-    key: Any = epoch.key
-    return None if day is None else datetime.combine(day, key, UTC)
+    return None
 
 
 def _is_number(value: object) -> bool:

@@ -19,10 +19,12 @@ from nav.aiding import Kind, aiding
 from nav.errors import HilError
 
 SYNC = b"\xb5\x62"
-LONGEST = 4096
-"""No message that we know is longer: a length beyond it is damage."""
+LONGEST = 2048
+"""A message that says to be longer is passed over: what waits for the end of a damaged one is lost for so long."""
 NAVIGATION = {0x07: "NAV-PVT", 0x36: "NAV-COV", 0x3C: "NAV-RELPOSNED"}
 """Messages of class NAV that are read."""
+LENGTHS = {0x07: (92,), 0x36: (64,), 0x3C: (40, 64)}
+"""Their payloads: another length is damage."""
 FIX_2D, FIX_3D, FIX_COMBINED = 2, 3, 4
 RTK_FIXED = 2
 PACKETS = 100 + 72
@@ -36,7 +38,10 @@ def size(data: bytes, at: int) -> int:
     if not SYNC.startswith(head[:2]):
         return NONE
     length = int.from_bytes(head[4:6], "little")
-    return MORE if len(head) < 6 else 8 + length if length <= LONGEST else NONE
+    if len(head) < 6:
+        return MORE
+    known = LENGTHS.get(head[3]) if head[2] == 0x01 else None
+    return 8 + length if length <= LONGEST and (known is None or length in known) else NONE
 
 
 def good(packet: bytes) -> bool:
