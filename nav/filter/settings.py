@@ -23,7 +23,7 @@ class Settings:
     lever_arm : (3,) float
         From the navigated point (the sensor, if it is not moved) to the GNSS antenna, b, m, as first known.
     antennas : tuple of (int, (3,) float)
-        Sources of GNSS that have antennas of their own, and where, likewise. What the filter learns of one place moves all.
+        Sources of GNSS that have antennas of their own, and where, likewise. An estimated lever arm moves all of them.
     delay : float
         How much older GNSS is than it says, s, as far as known: it is taken at that time. The estimated delay is what is left.
     field_n : (3,) float, optional
