@@ -428,7 +428,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
                 heard = now
                 stats["phase"] = Phase.RUNNING
         for k, ring in enumerate(outlets.aiding):
-            if ring.count > relayed_numbers[k]:
+            if ring.count > relayed_numbers[k] and not loop.finished:
                 copied, first = ring.pull(relayed, relayed_numbers[k])
                 relayed_numbers[k] = first + copied
                 _record(relayed[:copied], outlets, order.paced)
