@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import sys
 import threading
 import time
@@ -102,6 +103,10 @@ def flown(scenario: Scenario, ports: list[Path], emulators: list[Any], record: P
 
 
 @pytest.mark.alone
+@pytest.mark.skipif(
+    os.getloadavg()[0] > 2 * len(os.sched_getaffinity(0)),
+    reason="head, loop, two receivers and their sky in real time: a starved machine shifts the times of the fixes",
+)
 def test_two_receivers_with_arms_of_their_own_hold_the_position(tmp_path: Path) -> None:
     """The start is 11 m to the north of the truth; the antennas are 3.5 m apart. The recording replays to the same bits."""
     file, utc = tmp_path / "gnss.dhil", datetime.now(UTC)
