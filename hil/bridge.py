@@ -4,9 +4,9 @@
          \\-> aiding (to the navigator)                            \\-> frames ring (recorder)
 
 Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched: a measurement is taken
-between the samples between which it came. Measurements from the network come as frames too, in a ring of the publisher's,
-and are recorded like those of the bus. What the loop does on its own account (silence, an ordered alignment) goes into the
-recording as an event, so that a replay repeats it.
+between the samples between which it came. Measurements from the network and from receivers at ports of their own come as
+frames too, each in a ring of its sender's, and are recorded like those of the bus. What the loop does on its own account
+(silence, an ordered alignment) goes into the recording as an event, so that a replay repeats it.
 """
 
 import gc
@@ -90,6 +90,11 @@ class LoopOrder:
     own_world: bool = False
     realtime: bool = False
 
+    @property
+    def live(self) -> bool:
+        """In real time on a bus: what comes from elsewhere now belongs to the samples that come now."""
+        return self.paced and self.file is None
+
 
 @dataclass(frozen=True, slots=True)
 class Outlets:
@@ -98,22 +103,22 @@ class Outlets:
     states: Ring
     frames: Ring
     events: Ring
-    aiding: Ring
-    """Frames of measurements that the publisher has taken from the network."""
+    aiding: tuple[Ring, ...]
+    """Frames of measurements, a ring a writer: that of the publisher, then those of the receivers."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
     recording: bool = False
 
     @staticmethod
-    def make(*, recording: bool, readers: int) -> "Outlets":
-        """New rings, with `readers` wake-ups for solutions and one for frames."""
+    def make(*, recording: bool, readers: int, receivers: int = 0) -> "Outlets":
+        """New rings, with `readers` wake-ups for solutions and one for frames; `receivers` have one more each."""
         from drivers.can.frames import FRAME
 
         return Outlets(
             Ring(NAV_STATE, 8192, readers),
             Ring(FRAME, 1 << 16, 1),
             Ring(EVENTS, 256, 1),
-            Ring(FRAME, 1024, 0),
+            tuple(Ring(FRAME, 1024, 0) for _ in range(1 + receivers)),
             recording=recording,
         )
 
@@ -144,7 +149,7 @@ class Loop:
         self._calibrated = calibration.serial or None  # 0: of no particular head
         self._magnetometer = calibration.magnetometer
         self._outlets = outlets
-        self._live = order.paced and order.file is None
+        self._live = order.live
         self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
         self._truth = self._own_truth if order.own_world else None
         self._from_truth = scenario.navigation.alignment == "truth"
@@ -435,7 +440,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
     heard: int | None = None
     stats, control = outlets.stats, outlets.control
-    relayed, relayed_number = frames(BATCH), 0
+    relayed, relayed_numbers = frames(BATCH), [0] * len(outlets.aiding)
     trouble = ""
     while not (control.stop or loop.finished or source.exhausted):
         n = source.receive(batch, wait)
@@ -461,11 +466,12 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
                 stats.count(Times.ROUND, took)
                 if got and took > 1e9 * (loop.samples - samples) * (loop.driver.period_s or math.inf):
                     stats["overruns"] += 1
-        if outlets.aiding.count > relayed_number:
-            copied, first = outlets.aiding.pull(relayed, relayed_number)
-            relayed_number = first + copied
-            _record(relayed[:copied], outlets, order.paced)
-            loop.take(relayed[:copied])
+        for k, ring in enumerate(outlets.aiding):
+            if ring.count > relayed_numbers[k] and not loop.finished:
+                copied, first = ring.pull(relayed, relayed_numbers[k])
+                relayed_numbers[k] = first + copied
+                _record(relayed[:copied], outlets, order.paced)
+                loop.take(relayed[:copied])
         event = loop.ordered_event()
         if source.live and heard is not None and now - heard > silence_ns:
             heard = None

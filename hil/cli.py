@@ -58,6 +58,9 @@ def run(
     scenario: ScenarioName = None,
     bus: Bus = None,
     imu: Annotated[str | None, typer.Option(help="Driver of the board on the bus; then no head is simulated.")] = None,
+    gnss: Annotated[
+        list[str] | None, typer.Option(help="Port of a satellite receiver, serial:/dev/ttyACM0:115200; repeatable.")
+    ] = None,
     mavlink: Links = None,
     duration: Duration = None,
     speed: Speed = "1",
@@ -81,11 +84,20 @@ def run(
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
     )
+    if gnss:
+        chosen = chosen.with_receivers(gnss)
     outside = bool(chosen.bus) or imu is not None
     if outside and not _paced(speed):
         raise HilError(
             "--speed max needs the simulated head of `hil run`: leave --bus, --imu and the scenario's bus out"
         )
+    if chosen.receiver and not _paced(speed):
+        raise HilError("--speed max has no time in which a receiver could speak: leave it or the receivers out")
+    for receiver in chosen.receiver:
+        from drivers.serial.probe import check_receiver
+
+        if warning := check_receiver(receiver.port):
+            _say(warning)
     if chosen.bus.startswith("serial:"):
         from drivers.serial.probe import check_port
 
@@ -409,7 +421,9 @@ def _calibrate(
 
 @app.command()
 def configure(
-    driver: Annotated[str, typer.Argument(help="Driver of the board: xsens-xbus, vectornav, microstrain-mip.")],
+    driver: Annotated[
+        str, typer.Argument(help="xsens-xbus, vectornav, microstrain-mip, or ubx for a receiver of u-blox.")
+    ],
     bus: Annotated[str, typer.Option(help="serial:/dev/ttyUSB0:921600")],
     rate: Annotated[float, typer.Option(min=0.0, help="Samples a second, Hz.")],
     as_json: Json = False,

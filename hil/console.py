@@ -145,8 +145,14 @@ def print_summary(summary: dict[str, Any]) -> None:
         table.add_row("frozen counter, clock steps", f"{summary['frozen']}, {summary['clock_steps']}")
     if "bus_errors" in summary:
         table.add_row("CAN controller", ", ".join(f"{name} {count}" for name, count in summary["bus_errors"].items()))
-    if "overflowed" in summary:
+    if summary.get("overflowed"):
         table.add_row("frames dropped by the kernel", str(summary["overflowed"]))
+    for receiver in summary.get("receivers", []):
+        refused = ", ".join(f"{count} {reason}" for reason, count in receiver.get("refused", {}).items())
+        fixes = (
+            f"{receiver.get('fixes', 0)} fixes by {receiver.get('speaks') or 'nothing'}; refused: {refused or 'none'}"
+        )
+        table.add_row(f"receiver at {escape(receiver.get('port', '?'))}", fixes)
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")

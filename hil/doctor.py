@@ -176,7 +176,7 @@ def _serial(*, probe: bool) -> Iterator[Finding]:
 
 
 def _board(device: str) -> Finding:
-    from drivers.serial.probe import probe
+    from drivers.serial.probe import options_of, probe
 
     try:
         heard = probe(device)
@@ -184,7 +184,7 @@ def _board(device: str) -> Finding:
         return Finding(device, "lack", str(error))
     if heard is None:
         return Finding(device, "info", "no board that is known, at any usual rate")
-    return Finding(device, "ok", f"hil run --imu {heard.driver} --bus serial:{device}:{heard.baud}")
+    return Finding(device, "ok", f"hil run {options_of(heard, device)}")
 
 
 def _extras() -> Iterator[Finding]:

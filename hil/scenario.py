@@ -6,7 +6,7 @@ laid over the file with `Scenario.with_changes`.
 
 import json
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -274,6 +274,32 @@ class AidingConfig(_Model):
     """Of the World Magnetic Model."""
 
 
+class ReceiverConfig(_Model):
+    """A real receiver of satellite navigation at a port of its own."""
+
+    port: str
+    protocol: Literal["auto", "ubx", "nmea"] = "auto"
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """Place of the antenna in the body, forward-right-down of the navigated point."""
+    delay_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """How old the fastest fix is when it arrives."""
+    range_error_m: Positive = 4.0
+    """NMEA without GST: the position errs by this times the dilution of precision, one sigma."""
+    speed_error_ms: Positive = 0.3
+    """NMEA: one sigma of the velocity."""
+    heading_error_deg: Positive = 1.0
+    """NMEA: one sigma of a heading."""
+    heading_offset_deg: Finite = 0.0
+    """Heading of the line between two antennas less that of the body."""
+
+    @field_validator("port")
+    @classmethod
+    def _serial(cls, value: str) -> str:
+        if not value.startswith("serial:"):
+            raise ValueError("a receiver is at a serial port: serial:/dev/ttyACM0:115200")
+        return value
+
+
 class StartConfig(_Model):
     """A known start; what is left out comes from the alignment or from the motion's truth."""
 
@@ -406,6 +432,7 @@ class Scenario(_Model):
     aiding: AidingConfig = AidingConfig()
     wire: tuple[WireFault, ...] = ()
     """What becomes of the simulated head's frames on their way."""
+    receiver: Annotated[tuple[ReceiverConfig, ...], Field(max_length=16)] = ()
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
 
@@ -423,6 +450,12 @@ class Scenario(_Model):
     def with_changes(self, **changes: Any) -> "Scenario":
         """A copy with `changes` laid over it (nested dictionaries reach nested keys), validated anew."""
         return validated(_merged(self.model_dump(mode="json"), changes), "command line")
+
+    def with_receivers(self, ports: Sequence[str]) -> "Scenario":
+        """A copy with receivers at `ports`, which aid the navigator; the first ones are those of the scenario, at other ports."""
+        known = [one.model_dump(mode="json") for one in self.receiver]
+        receivers = [{**dict(enumerate(known)).get(k, {}), "port": port} for k, port in enumerate(ports)]
+        return self.with_changes(receiver=receivers, navigation={"aided": True})
 
     def world_id(self) -> int:
         """A 32-bit fingerprint of what the simulated head does: motion, head and seed; never 0.

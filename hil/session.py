@@ -1,6 +1,7 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
     feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, this process
+                                receivers --rings--^
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
 """
@@ -23,6 +24,7 @@ from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.clock import clock_summary
 from hil.control import READERS, run_part
 from hil.publisher import Taps, run_publisher
+from hil.receiver import run_receiver
 from hil.recorder import run_recorder
 from hil.ring import Wake
 from hil.stats import Phase, Times
@@ -92,7 +94,8 @@ class Session:
         publish: bool = True,
     ) -> None:
         self.order = order
-        self.outlets = Outlets.make(recording=record is not None, readers=1)
+        self._receivers = {f"receiver {k}": one for k, one in enumerate(order.scenario.receiver if order.live else ())}
+        self.outlets = Outlets.make(recording=record is not None, readers=1, receivers=len(self._receivers))
         self._feeder = feeder
         self._record = record
         self._publish = publish
@@ -128,7 +131,8 @@ class Session:
     def _start(self) -> None:
         scenario, outlets = self.order.scenario, self.outlets
         context = mp.get_context("forkserver")
-        context.set_forkserver_preload(["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"])
+        preload = ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
+        context.set_forkserver_preload([*preload, "hil.receiver"] if self._receivers else preload)
 
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
@@ -152,10 +156,11 @@ class Session:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
-            live = self.order.paced and self.order.file is None
-            network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
+            network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, outlets.stats)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
+        for k, (name, config) in enumerate(self._receivers.items()):
+            launch(name, run_receiver, config, k, outlets.stats, outlets.aiding[1 + k], outlets.control)
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -173,8 +178,8 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
-        recorder = self._parts.get("recorder")
-        if self.outlets.stats["phase"] == Phase.STARTING or (recorder and "ready" not in recorder.answers):
+        heralds = [part for name, part in self._parts.items() if name == "recorder" or name in self._receivers]
+        if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in heralds):
             return False
         if not self.outlets.control.go:
             self._began = time.monotonic()
@@ -301,7 +306,7 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher"):
+        for name in ("loop", "feeder", "recorder", "publisher", *self._receivers):
             part = self._parts.get(name)
             if part is None:
                 continue
@@ -320,6 +325,11 @@ class Session:
             part.read()
             self.problems += part.problems
             part.problems.clear()
+
+    def _answers(self, name: str) -> _Answers:
+        part = self._parts[name]
+        part.read()
+        return {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
 
     def summary(self) -> dict[str, Any]:
         """What the run showed, as `hil run --json` prints it; complete after the end."""
@@ -340,19 +350,20 @@ class Session:
             if (utc := self._pulses.summary()) is not None:
                 clock["utc"] = utc
         for name in ("loop", "feeder", "publisher", "recorder"):
-            part = self._parts.get(name)
-            if part is not None:
-                part.read()
-                answers = {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
+            if name in self._parts:
+                answers = self._answers(name)
                 if name == "loop":
                     result.update(answers)
                 else:
                     result[name] = answers
         if "wire" in result.get("feeder", {}):
             result["wire"] = result["feeder"].pop("wire")
+        if self._receivers:
+            result["receivers"] = [self._answers(name) for name in self._receivers]
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
-        if self.problems:
-            result["problems"] = self.problems
+        told = [one["problem"] for one in result.get("receivers", []) if "problem" in one]
+        if self.problems or told:
+            result["problems"] = self.problems + told
         return result
 
 

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RELAYED = 128
-"""Sources from here on to 255 are those of another network, for which a relay sends."""
+"""Sources from here on are those of another network, for which a relay sends."""
+AT_PORTS = 192
+"""Sources from here on to 255 are receivers at ports of their own, each of which sends for itself."""
 
 
 class Kind(IntEnum):
