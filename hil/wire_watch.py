@@ -3,7 +3,7 @@
 So a bad wire fills no screen; the counters of the summary have the rest. Nothing is formatted while the counters stand still.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from drivers import Counters
@@ -70,8 +70,13 @@ class WireWatch:
         self.errors = BusErrors()
         """What the error frames have said."""
 
-    def look(self, batch: FrameArray, counts: list[int], now_s: float) -> Iterator[Said]:
+    def look(self, batch: FrameArray, counts: list[int], now_s: float) -> Iterable[Said]:
         """What is new with the counters `counts` after `batch`, at the device time `now_s`."""
+        if not self._faults and counts[_FIRST:] == self._before:
+            return ()
+        return self._news(batch, counts, now_s)
+
+    def _news(self, batch: FrameArray, counts: list[int], now_s: float) -> Iterator[Said]:
         if counts[_FIRST:] != self._before:
             before, self._before = dict(zip(self._names, self._before, strict=True)), counts[_FIRST:]
             for name, count in zip(self._names, self._before, strict=True):

@@ -33,6 +33,8 @@ WARM_S = 60.0
 """Memory is judged from here on, or from a third of a shorter run: buffers and caches fill first."""
 GROWTH_KIB_MIN = 64.0
 """A process whose memory grows faster than this leaks: 90 MiB a day."""
+LEAST_KIB = 1024.0
+"""Growth that says nothing: what larger batches touch for the first time."""
 PAGE_KIB = os.sysconf("SC_PAGE_SIZE") / 1024
 
 
@@ -61,11 +63,19 @@ def resident_kib(pid: int) -> float:
     return (int(resident) - int(shared)) * PAGE_KIB
 
 
-def slope_kib_min(times: list[float], sizes: list[float]) -> float:
+def slope_kib_min(sizes: list[tuple[float, float]]) -> float:
     """Growth of the floor of a process's memory, KiB a minute: least of ten stretches, a line through them."""
-    pieces = [piece for piece in np.array_split(np.array([times, sizes]).T, 10) if len(piece)]
+    pieces = [piece for piece in np.array_split(np.array(sizes), 10) if len(piece)]
     floor = np.array([piece[np.argmin(piece[:, 1])] for piece in pieces])
     return float(np.polyfit(floor[:, 0], floor[:, 1], 1)[0] * 60.0) if len(floor) > 1 else 0.0
+
+
+def grown(name: str, sizes: list[tuple[float, float]], duration_s: float) -> tuple[str, bool]:
+    """What the memory of a process did, in words, and whether it is flat."""
+    warm = [row for row in sizes if row[0] > min(WARM_S, duration_s / 3)] or sizes
+    slope, minutes = slope_kib_min(warm), (warm[-1][0] - warm[0][0]) / 60.0
+    text = f"{name}: {warm[-1][1] / 1024:.1f} MiB of its own, {slope:+.1f} KiB/min"
+    return text, slope * minutes < max(GROWTH_KIB_MIN * minutes, LEAST_KIB)
 
 
 def recorded(path: Path) -> int:
@@ -159,10 +169,7 @@ def main() -> int:
         path = Path(folder) / "soak.dhil"
         summary, memory = flown(scenario, path, chosen.minutes)
         rows = judged(summary, recorded(path))
-    for name, sizes in memory.items():
-        warm = [(moment, size) for moment, size in sizes if moment > min(WARM_S, duration_s / 3)]
-        slope = slope_kib_min(*map(list, zip(*warm, strict=True))) if warm else 0.0
-        rows.append((f"{name}: {sizes[-1][1] / 1024:.1f} MiB of its own, {slope:+.1f} KiB/min", slope < GROWTH_KIB_MIN))
+    rows += [grown(name, sizes, duration_s) for name, sizes in memory.items()]
     failed = [text for text, good in rows if not good]
     if chosen.json:
         print(json.dumps({"failed": failed, "rows": [text for text, _ in rows], "summary": summary}))

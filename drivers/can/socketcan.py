@@ -126,7 +126,7 @@ class SocketCanPort:
         try:
             sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except (OSError, AttributeError) as error:
-            raise HilError(f"bus socketcan:{self.interface}: {explain(self.interface, error)}") from error
+            raise HilError(self._why(error)) from error
         try:
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
             if self._listen:
@@ -146,14 +146,17 @@ class SocketCanPort:
                 raise OSError(errno.ENETDOWN, os.strerror(errno.ENETDOWN))
         except OSError as error:
             sock.close()
-            raise HilError(f"bus socketcan:{self.interface}: {explain(self.interface, error)}") from error
+            raise HilError(self._why(error)) from error
         sock.setblocking(False)
         self._overflow_base = self.overflowed
         return sock
 
+    def _why(self, error: Exception) -> str:
+        return f"bus socketcan:{self.interface}: {explain(self.interface, error)}"
+
     def _failed(self, code: int) -> None:
         self.failures += 1
-        self.trouble = explain(self.interface, OSError(code, os.strerror(code)))
+        self.trouble = self._why(OSError(code, os.strerror(code)))
         if self._socket is not None:
             self._socket.close()
         self._socket = None
