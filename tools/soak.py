@@ -100,8 +100,8 @@ def flown(
         while session.running:
             now = time.monotonic()
             for name, part in session._parts.items():
-                if part.process.is_alive() and part.process.pid:
-                    memory.setdefault(name, []).append((now - began, resident_kib(part.process.pid)))
+                if part.process.is_alive() and part.process.pid and (own := resident_kib(part.process.pid)) > 0.0:
+                    memory.setdefault(name, []).append((now - began, own))
             session.events()
             if now - said > 60.0:
                 said = now
@@ -172,7 +172,8 @@ def main() -> int:
     rows += [grown(name, sizes, duration_s) for name, sizes in memory.items()]
     failed = [text for text, good in rows if not good]
     if chosen.json:
-        print(json.dumps({"failed": failed, "rows": [text for text, _ in rows], "summary": summary}))
+        own = {name: [round(size) for _, size in sizes[:: max(len(sizes) // 20, 1)]] for name, sizes in memory.items()}
+        print(json.dumps({"failed": failed, "rows": [text for text, _ in rows], "own_kib": own, "summary": summary}))
     else:
         print(
             f"{chosen.minutes:g} min at {chosen.rate:g} Hz on {chosen.bus}, seed {chosen.seed}: {len(scenario.wire)} faults"

@@ -22,6 +22,8 @@ from nav.errors import HilError
 
 MAGIC = b"DTGHIL recording 1\n"
 FLUSH_S = 0.05
+RETRY_S = 0.5
+"""Time between tries to write on a disk that was full."""
 BLOCK = 4096
 """Most frames in one block."""
 LONGEST_HEADER = 1 << 24
@@ -72,6 +74,7 @@ class RecordingWriter:
         self._block = frames(BLOCK)
         self._filled = 0
         self._flushed = time.monotonic()
+        self._retry = 0.0
         self.written = 0
         """Records written."""
         self.lost = 0
@@ -98,6 +101,9 @@ class RecordingWriter:
         count, self._filled = self._filled, 0
         if not count:
             return
+        if self.problem and self._flushed < self._retry:
+            self.lost += count
+            return
         data = self._block[:count].tobytes()
         try:
             self._end += self._put(_BLOCK_HEAD.pack(b"BLK1", count, zlib.crc32(data)) + data)
@@ -105,6 +111,7 @@ class RecordingWriter:
             self.problem = ""
         except OSError as error:
             self.lost += count
+            self._retry = self._flushed + RETRY_S
             self.problem = f"recording {self.path}: {error.strerror}"
             with contextlib.suppress(OSError):
                 self._file.truncate(self._end)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.can.frames import FrameArray, frames
-from drivers.logs.recording import RecordingReader, RecordingWriter
+from drivers.logs.recording import RETRY_S, RecordingReader, RecordingWriter
 from nav.errors import HilError
 
 KEPT_NS = 100_000_000
@@ -70,6 +70,7 @@ def test_a_disk_that_is_full_and_has_room_again(tmp_path: Path) -> None:
             assert read(path)[1] == ""
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        time.sleep(RETRY_S)
         writer.write(batch[200:])
         writer.flush()
         assert writer.problem == ""
