@@ -16,6 +16,7 @@ from nav.errors import HilError
 
 if TYPE_CHECKING:
     from hil.bridge import LoopOrder
+    from hil.scenario import Scenario
     from hil.session import Session
 
 COMMON_BUS = "unix:dtg-hil"
@@ -37,6 +38,11 @@ Links = Annotated[
     list[str] | None,
     typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
+Key = Annotated[
+    Path | None, typer.Option("--mavlink-key", help="Sign MAVLink with the key in this file, take nothing unsigned.")
+]
+Tlog = Annotated[Path | None, typer.Option(help="Log the first MAVLink link to this file (.tlog).")]
+Mcap = Annotated[Path | None, typer.Option(help="Write solutions and events for Foxglove to this file (.mcap).")]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
 Asserts = Annotated[
     list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
@@ -55,6 +61,9 @@ def run(
     speed: Speed = "1",
     seed: Seed = None,
     record: Record = None,
+    mavlink_key: Key = None,
+    tlog: Tlog = None,
+    mcap: Mcap = None,
     assertion: Asserts = None,
     junit: Junit = None,
     no_dashboard: Annotated[
@@ -72,6 +81,7 @@ def run(
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
     )
+    chosen = _links(chosen, mavlink_key, tlog)
     outside = bool(chosen.bus) or imu is not None
     if outside and not _paced(speed):
         raise HilError(
@@ -87,7 +97,7 @@ def run(
         paced=_paced(speed),
         own_world=not outside,
     )
-    _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
+    _run(order, None if outside else simulated_head(order), record, assertion, junit, mcap=mcap, as_json=as_json)
 
 
 @app.command()
@@ -120,6 +130,9 @@ def replay(
     mavlink: Links = None,
     speed: Speed = "1",
     record: Record = None,
+    mavlink_key: Key = None,
+    tlog: Tlog = None,
+    mcap: Mcap = None,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
     withhold: Annotated[
         list[str] | None,
@@ -138,7 +151,8 @@ def replay(
     from hil.player import plan_replay, run_player
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
-    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold)))
+    changed = order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold))
+    order = replace(order, scenario=_links(changed, mavlink_key, tlog))
     if plot is not None:
         if order.reference is None:
             raise HilError(f"--plot: {log} carries no attitude to compare with")
@@ -155,7 +169,7 @@ def replay(
 
         return {"smoothed": smooth_recording(log, order.scenario, smooth)}
 
-    summary = _run(order, feeder, record, assertion, junit, smoothed, as_json=as_json)
+    summary = _run(order, feeder, record, assertion, junit, smoothed, mcap=mcap, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -468,6 +482,7 @@ def _run(
     junit: Path | None,
     more: Callable[[], dict[str, Any]] = dict,
     *,
+    mcap: Path | None = None,
     as_json: bool,
 ) -> dict[str, Any]:
     """Run a session to its end, show it with what `more` adds, check the assertions; the summary."""
@@ -479,7 +494,7 @@ def _run(
     if junit is not None and not checks:
         raise HilError("--junit needs at least one --assert")
     stop = _StopSignal()
-    session = Session(order, feeder=feeder, record=record_to)
+    session = Session(order, feeder=feeder, record=record_to, mcap=mcap)
     with session, RunView(session) as view:
         while not (session.ready or stop.wanted):
             view.show_compiling()
@@ -535,6 +550,15 @@ def _paced(speed: str) -> bool:
     if speed not in {"1", "max"}:
         raise HilError(f"--speed {speed}: expected 1 or max")
     return speed == "1"
+
+
+def _links(scenario: "Scenario", key: Path | None, tlog: Path | None) -> "Scenario":
+    from hil.cli_mavlink import open_doors, with_mavlink
+
+    chosen = with_mavlink(scenario, key, tlog)
+    for line in open_doors(chosen):
+        _say(line)
+    return chosen
 
 
 def _changes(mavlink: list[str] | None = None, withhold: list[str] | None = None, **options: Any) -> dict[str, Any]:

@@ -8,21 +8,22 @@ import math
 import selectors
 import signal
 import time
-from collections import Counter
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.mavlink.endpoint import Endpoint
+from drivers.mavlink.hub import Hub, total
 from drivers.mavlink.intake import Intake
-from drivers.mavlink.link import open_link
+from drivers.mavlink.options import LinkOptions, parse_options
+from drivers.mavlink.signing import Signer, read_key
 from drivers.mavlink.station import Identity, Station
+from drivers.mavlink.store import Store, state_folder
 from hil.control import Control
 from hil.geoid import undulation
 from hil.ring import Ring, Wake
@@ -78,9 +79,9 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
     stop : Wake
         Ends the publisher.
     report : Connection
-        Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
-        same for each URL), ``latency_us`` (arrival of the sample to the end of sending, `None` without one) and, where
-        measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
+        Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``refused`` (by reason), ``bad_data``,
+        ``dropped``, ``lost``, ``links`` (the same for each URL), ``latency_us`` (arrival of the sample to the end of sending,
+        `None` without one) and, where measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
         ``failed``, a text, when a link could not be opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
@@ -90,16 +91,16 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
             intake = _intake(config, taps)
             order = partial(_obey, control=taps.control)
             station = Station(identity, config.rates_hz, undulation, order, intake)
-            endpoints = []
-            for url in config.links:
-                link = open_link(url)
-                stack.callback(link.close)
-                endpoints.append(Endpoint(station, link))
+            signer = _signer(config)
+            if signer is not None:
+                stack.callback(signer.close)
+            hub = Hub(station, _links(config), signer)
+            stack.callback(hub.close)
         except HilError as error:
             _tell(report, {"failed": str(error)})
             return
         _warm_up(station)
-        publisher = _Publisher(taps, station, endpoints)
+        publisher = _Publisher(taps, station, hub)
         stack.callback(publisher.close)
         publisher.run(stop, report)
         _tell(report, publisher.counters())
@@ -108,9 +109,9 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
 class _Publisher:
     """The state of one run."""
 
-    def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
+    def __init__(self, taps: Taps, station: Station, hub: Hub) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
-        self._station, self._endpoints = station, endpoints
+        self._station, self._hub = station, hub
         self._row = np.zeros(1, NAV_STATE)
         self._events, self._event_number = taps.events, 0
         self._notes = np.zeros(16, taps.events.dtype)
@@ -121,8 +122,7 @@ class _Publisher:
         self._aged = 0
         self._selector = selectors.DefaultSelector()
         self._watching = False
-        for endpoint in endpoints:
-            self._selector.register(endpoint.link, selectors.EVENT_READ)
+        self._selector.register(hub, selectors.EVENT_READ)
 
     def close(self) -> None:
         self._selector.close()
@@ -153,12 +153,12 @@ class _Publisher:
         return next_s
 
     def _hungry(self) -> bool:
-        return any(endpoint.waits for endpoint in self._endpoints)
+        return any(endpoint.waits for endpoint in self._hub.endpoints)
 
     def _poll(self, now_s: float) -> float:
-        before = sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints)
-        next_s = min((endpoint.poll(now_s) for endpoint in self._endpoints), default=now_s + _SILENCE_S)
-        if sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints) != before:
+        before = sum(endpoint.sent["ATTITUDE"] for endpoint in self._hub.endpoints)
+        next_s = self._hub.poll(now_s)
+        if sum(endpoint.sent["ATTITUDE"] for endpoint in self._hub.endpoints) != before:
             self._ages_ns[self._aged % _AGES] = time.time_ns() - self._row["arrival_ns"][0]
             self._aged += 1
         return next_s
@@ -192,24 +192,11 @@ class _Publisher:
 
     def counters(self) -> dict[str, Any]:
         """What was sent and received, for the report."""
-        links = {
-            endpoint.link.url: {
-                "sent": dict(endpoint.sent),
-                "received": dict(endpoint.received),
-                "bad_data": endpoint.bad_data,
-                "dropped": endpoint.dropped,
-            }
-            for endpoint in self._endpoints
-        }
-        total: dict[str, Any] = {
-            key: dict(sum((getattr(endpoint, key) for endpoint in self._endpoints), Counter[str]()))
-            for key in ("sent", "received")
-        }
-        for key in ("bad_data", "dropped"):
-            total[key] = sum(getattr(endpoint, key) for endpoint in self._endpoints)
+        links = self._hub.tallies()
+        totals = total(links.values())
         if (intake := self._station.intake) is not None:
-            total["aiding"] = {"taken": dict(intake.taken), "refused": dict(intake.refused)}
-        return total | {"links": links, "latency_us": self._latency()}
+            totals["aiding"] = {"taken": dict(intake.taken), "refused": dict(intake.refused)}
+        return totals | {"links": links, "latency_us": self._latency()}
 
     def _latency(self) -> dict[str, float] | None:
         ages_us = self._ages_ns[: min(self._aged, _AGES)] / 1e3
@@ -234,6 +221,18 @@ def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
         ring.push(batch)
 
     return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, early=taps.early)
+
+
+def _links(config: MavlinkConfig) -> list[LinkOptions]:
+    return [parse_options(one) if isinstance(one, str) else LinkOptions(**one.model_dump()) for one in config.links]
+
+
+def _signer(config: MavlinkConfig) -> Signer | None:
+    """What signs; its times outlive the run, whatever the key."""
+    if not config.signing_key:
+        return None
+    store = Store(state_folder() / "mavlink-signing.json")
+    return Signer(read_key(Path(config.signing_key).expanduser()), store, config.accept_unsigned)
 
 
 def _obey(command: str, control: Control) -> None:

@@ -11,17 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from drivers.mavlink.messages import KINDS
+from drivers.mavlink.messages import KINDS, LONGEST_HEARTBEAT_S, SHORTEST_INTERVAL_S
 
 if TYPE_CHECKING:
     from drivers.mavlink.endpoint import Endpoint
 
 MESSAGE_NAMES = {int(getattr(mav, f"MAVLINK_MSG_ID_{name}")): name for name in KINDS}
 """Messages that have a rate, by number."""
-
-SHORTEST_INTERVAL_S = 0.001
-LONGEST_HEARTBEAT_S = 2.0
-"""Ground stations declare the link lost after 3.5 s."""
 
 _STREAMS = {
     mav.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU",),
@@ -106,8 +102,10 @@ def _set_message_interval(params: list[float], endpoint: "Endpoint") -> int:
     name, interval_s = _name_of(params[0]), params[1] * 1e-6
     if name is None:
         return int(mav.MAV_RESULT_UNSUPPORTED)
+    if not endpoint.allows(name):
+        return int(mav.MAV_RESULT_DENIED)
     if params[1] == 0.0:
-        endpoint.set_interval(name, endpoint.station.interval_s(name))
+        endpoint.set_interval(name, endpoint.default_s(name))
     elif params[1] == -1.0 and name != "HEARTBEAT":
         endpoint.set_interval(name, 0.0)
     elif interval_s >= SHORTEST_INTERVAL_S and interval_s <= (LONGEST_HEARTBEAT_S if name == "HEARTBEAT" else 1e6):
@@ -132,7 +130,7 @@ def _request_message(params: list[float], endpoint: "Endpoint") -> int:
     if params[0] == mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
         return _request_version(params, endpoint)
     name = _name_of(params[0])
-    if name is None:
+    if name is None or not endpoint.allows(name):
         return int(mav.MAV_RESULT_UNSUPPORTED)
     return int(mav.MAV_RESULT_ACCEPTED if endpoint.send_now(name) else mav.MAV_RESULT_TEMPORARILY_REJECTED)
 
@@ -159,7 +157,7 @@ def _calibrate(params: list[float], endpoint: "Endpoint") -> int:
 def _request_data_stream(message: Any, endpoint: "Endpoint") -> None:
     rate_hz = float(message.req_message_rate) if message.start_stop else 0.0
     interval_s = max(1.0 / rate_hz, SHORTEST_INTERVAL_S) if rate_hz > 0.0 else 0.0
-    for name in _STREAMS.get(message.req_stream_id, ()):
+    for name in filter(endpoint.allows, _STREAMS.get(message.req_stream_id, ())):
         endpoint.set_interval(name, interval_s)
 
 
@@ -204,6 +202,10 @@ def _ping(message: Any, endpoint: "Endpoint") -> None:
         endpoint.send(mav.MAVLink_ping_message(message.time_usec, message.seq, *sender))
 
 
+def _setup_signing(_: Any, endpoint: "Endpoint") -> None:
+    endpoint.station.tell("warning", "A signing key is taken from a file, not from the network")
+
+
 def _ftp(message: Any, endpoint: "Endpoint") -> None:
     """There are no files: say so, or a client asks again and again."""
     request = bytes(message.payload)
@@ -240,5 +242,6 @@ _HANDLERS: dict[str, Callable[[Any, "Endpoint"], None]] = {
     "MISSION_CLEAR_ALL": _mission_ack(mav.MAV_MISSION_ACCEPTED),
     "TIMESYNC": _timesync,
     "PING": _ping,
+    "SETUP_SIGNING": _setup_signing,
     "FILE_TRANSFER_PROTOCOL": _ftp,
 }

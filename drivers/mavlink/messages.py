@@ -6,13 +6,14 @@ altitudes are above mean sea level, times are device time.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.solution import Home, Solution
+from nav.errors import HilError
 from nav.state import Health, Mode, Ratio
 
 Message = Any
@@ -267,6 +268,32 @@ KINDS = {
     "HEARTBEAT": Kind(heartbeat, 1.0, "SR_BEAT_HZ", from_solution=False),
 }
 """Every message that is sent at a rate, most urgent first."""
+
+
+SHORTEST_INTERVAL_S = 0.001
+LONGEST_HEARTBEAT_S = 2.0
+"""Ground stations declare the link lost after 3.5 s."""
+
+
+def slowest_hz(name: str) -> float:
+    """Lowest rate of a message of the table."""
+    return 1.0 / LONGEST_HEARTBEAT_S if name == "HEARTBEAT" else 0.0
+
+
+def check_rates(rates_hz: Mapping[str, float], where: str) -> None:
+    """Refuse rates of unknown messages and those out of range; `where` names them.
+
+    Raises
+    ------
+    HilError
+        There is one.
+    """
+    for name, rate_hz in rates_hz.items():
+        if name not in KINDS:
+            raise HilError(f"{where}.{name}: unknown message; expected one of {', '.join(KINDS)}")
+        lowest = slowest_hz(name)
+        if not lowest <= rate_hz <= 1.0 / SHORTEST_INTERVAL_S:
+            raise HilError(f"{where}.{name} = {rate_hz}: expected {lowest:g} to 1000 Hz")
 
 
 def _estimate_flags(solution: Solution) -> int:

@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from drivers.mavlink.commands import SHORTEST_INTERVAL_S
 from drivers.mavlink.intake import Intake
-from drivers.mavlink.messages import KINDS, VEHICLES, Situation
+from drivers.mavlink.messages import KINDS, SHORTEST_INTERVAL_S, VEHICLES, Situation, check_rates, slowest_hz
 from drivers.mavlink.parameters import Parameter, Parameters
 from drivers.mavlink.solution import Home, Solution, Undulation
 from nav.errors import HilError
 from nav.state import NAV_STATE, Health, Mode
 
-_SLOWEST_HEARTBEAT_HZ = 0.5
 _NOTES = 16
 """Most notes that wait to be told."""
 _SEVERITIES = {
@@ -71,12 +69,7 @@ class Station:
     ) -> None:
         if identity.vehicle not in VEHICLES:
             raise HilError(f"mavlink.vehicle = {identity.vehicle!r}: unknown; expected one of {', '.join(VEHICLES)}")
-        for name, rate_hz in rates_hz.items():
-            if name not in KINDS:
-                raise HilError(f"mavlink.rates_hz.{name}: unknown message; expected one of {', '.join(KINDS)}")
-            lowest = _SLOWEST_HEARTBEAT_HZ if name == "HEARTBEAT" else 0.0
-            if not lowest <= rate_hz <= 1.0 / SHORTEST_INTERVAL_S:
-                raise HilError(f"mavlink.rates_hz.{name} = {rate_hz}: expected {lowest:g} to 1000 Hz")
+        check_rates(rates_hz, "mavlink.rates_hz")
         self.identity = identity
         self.geoid = geoid
         self.on_command = on_command
@@ -137,7 +130,7 @@ class Station:
             Parameter("HIL_VEHICLE", lambda: float(VEHICLES[identity.vehicle])),
         ]
         for name, kind in KINDS.items():
-            lowest = _SLOWEST_HEARTBEAT_HZ if name == "HEARTBEAT" else 0.0
+            lowest = slowest_hz(name)
             table.append(Parameter(kind.parameter, self._get(name), self._set(name), lowest, 1.0 / SHORTEST_INTERVAL_S))
         return table
 
