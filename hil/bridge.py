@@ -39,7 +39,7 @@ from hil.stats import Phase, Stats
 from hil.warmup import warm_loop
 from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
-from nav.aiding import Kind
+from nav.aiding import AIDING, Kind, of_receivers
 from nav.errors import HilError
 from nav.filter.record import Recorder
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
@@ -94,6 +94,8 @@ class Outlets:
     events: Ring
     aiding: Ring
     """Frames of measurements that the publisher has taken from the network."""
+    fixes: Ring
+    """What receivers have measured, for the publisher."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
     recording: bool = False
@@ -108,6 +110,7 @@ class Outlets:
             Ring(FRAME, 1 << 16, 1),
             Ring(EVENTS, 256, 1),
             Ring(FRAME, 1024, 0),
+            Ring(AIDING, 64, 0),
             recording=recording,
         )
 
@@ -167,6 +170,8 @@ class Loop:
         rows, places = self._aiding.decode(batch, self._now)
         if self._magnetometer is not None:
             correct(self._magnetometer, rows)
+        if (fixes := of_receivers(rows)).any():
+            self._outlets.fixes.push(rows[fixes])
         cuts = np.flatnonzero(aided[1:] & ~aided[:-1]) + 1
         got, start, taken = False, 0, 0
         for stop in (*cuts.tolist(), len(batch)):

@@ -244,13 +244,18 @@ def decode(
 @app.command()
 def export(
     file: Annotated[Path, typer.Argument(help="Recording of frames.")],
-    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet.")],
+    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet; or .mcap.")],
     imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the samples of a recording as a table, a column a signal."""
+    """Write the samples of a recording as a table, a column a signal; or its navigation for Foxglove (.mcap)."""
     import numpy as np
 
+    if out.suffix == ".mcap":
+        from hil.mcap_recorder import export_mcap
+
+        _report(export_mcap(file, imu, out), as_json=as_json)
+        return
     from hil.samples import read_samples
     from hil.tables import write_table
 

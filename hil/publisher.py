@@ -28,6 +28,7 @@ from hil.control import Control
 from hil.geoid import undulation
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
+from nav.aiding import AIDING
 from nav.errors import HilError
 from nav.state import NAV_STATE
 
@@ -57,6 +58,8 @@ class Taps:
         Of `FRAME`: takes measurements from the network to the loop.
     early : bool
         They serve the alignment as well.
+    fixes : Ring, optional
+        Of `AIDING`: what receivers have measured.
     """
 
     states: Ring
@@ -65,6 +68,7 @@ class Taps:
     control: Control
     aiding: Ring | None = None
     early: bool = False
+    fixes: Ring | None = None
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -90,7 +94,7 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
             identity = Identity(config.system_id, config.component_id, config.vehicle)
             intake = _intake(config, taps)
             order = partial(_obey, control=taps.control)
-            station = Station(identity, config.rates_hz, undulation, order, intake)
+            station = Station(identity, config.rates_hz, undulation, order, intake, _parameter_store(config))
             signer = _signer(config)
             if signer is not None:
                 stack.callback(signer.close)
@@ -113,6 +117,7 @@ class _Publisher:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
         self._station, self._hub = station, hub
         self._row = np.zeros(1, NAV_STATE)
+        self._fixes, self._fix, self._fixed = taps.fixes, np.zeros(1, AIDING), 0
         self._events, self._event_number = taps.events, 0
         self._notes = np.zeros(16, taps.events.dtype)
         self._seen = 0
@@ -173,6 +178,9 @@ class _Publisher:
             self._silent = True
             self._station.silence()
         self._station.set_loss(self._control.lost, self._control.samples)
+        if self._fixes is not None and self._fixes.count != self._fixed and self._fixes.latest(self._fix):
+            self._fixed = self._fixes.count
+            self._station.set_fix(self._fix[0])
         copied, first = self._events.pull(self._notes, self._event_number)
         self._event_number = first + copied
         for note in self._notes[:copied][self._notes["station"][:copied]]:
@@ -209,7 +217,7 @@ class _Publisher:
 def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
     """What is taken from the network, as frames of a sender of its own to the loop."""
     ring = taps.aiding
-    if ring is None or not config.aiding:
+    if ring is None or not (config.aiding or config.operator):
         return None
     from drivers.can.aiding import AidingEncoder
 
@@ -220,7 +228,8 @@ def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
         batch["time_ns"] = time.time_ns()
         ring.push(batch)
 
-    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, early=taps.early)
+    how = {"early": taps.early, "measurements": config.aiding}
+    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, **how)
 
 
 def _links(config: MavlinkConfig) -> list[LinkOptions]:
@@ -233,6 +242,12 @@ def _signer(config: MavlinkConfig) -> Signer | None:
         return None
     store = Store(state_folder() / "mavlink-signing.json")
     return Signer(read_key(Path(config.signing_key).expanduser()), store, config.accept_unsigned)
+
+
+def _parameter_store(config: MavlinkConfig) -> Store | None:
+    if not config.keep_parameters:
+        return None
+    return Store(state_folder() / f"parameters-{config.system_id}-{config.component_id}.json")
 
 
 def _obey(command: str, control: Control) -> None:

@@ -376,8 +376,10 @@ class MavlinkConfig(_Model):
     """Message name to rate, over the built-in rates; 0 switches a message off."""
     aiding: bool = False
     """Take measurements from the network."""
+    operator: bool = False
+    """Take position and heading from a person at a ground station."""
     aiding_from: tuple[Annotated[int, Field(ge=1, le=255)], ...] = (255,)
-    """Systems that may send them."""
+    """Systems that may send measurements, position, heading and home."""
     aiding_delay_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """How old they are when they come."""
     master: tuple[Annotated[int, Field(ge=1, le=255)], Annotated[int, Field(ge=1, le=255)]] | None = None
@@ -386,6 +388,8 @@ class MavlinkConfig(_Model):
     """File of the key; empty: nothing is signed."""
     accept_unsigned: tuple[str, ...] = ()
     """Messages that are taken without a signature."""
+    keep_parameters: bool = True
+    """What a ground station sets holds in later runs."""
 
 
 class Scenario(_Model):

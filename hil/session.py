@@ -20,6 +20,7 @@ import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.control import run_part
+from hil.mcap_recorder import run_mcap
 from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -73,6 +74,8 @@ class Session:
         Recording to write.
     publish : bool
         Send MAVLink on the links of the scenario.
+    mcap : Path, optional
+        File for Foxglove to write; in real time only.
     """
 
     def __init__(
@@ -82,12 +85,16 @@ class Session:
         feeder: tuple[Callable[..., None], Sequence[Any]] | None = None,
         record: Path | None = None,
         publish: bool = True,
+        mcap: Path | None = None,
     ) -> None:
+        if mcap is not None and not order.paced:
+            raise HilError("--mcap needs real time: record the run with --record FILE, then `hil export FILE out.mcap`")
         self.order = order
         self.outlets = Outlets.make(recording=record is not None, readers=1)
         self._feeder = feeder
         self._record = record
         self._publish = publish
+        self._mcap = mcap
         self._publisher_stop = Wake()
         self._parts: dict[str, _Part] = {}
         self._event_number = 0
@@ -122,7 +129,7 @@ class Session:
             ours, theirs = context.Pipe()
             process = context.Process(
                 target=run_part,
-                args=(outlets.control, PUBLISHER_NICE if name == "publisher" else 0, target, *args, theirs),
+                args=(outlets.control, PUBLISHER_NICE if name in {"publisher", "mcap"} else 0, target, *args, theirs),
                 name=f"hil-{name}",
                 daemon=True,
             )
@@ -133,6 +140,8 @@ class Session:
         if self._record is not None:
             header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
             launch("recorder", run_recorder, self._record, header, outlets)
+        if self._mcap is not None:
+            launch("mcap", run_mcap, self._mcap, outlets)
         launch("loop", run_loop, self.order, outlets)
         if self._feeder is not None:
             target, args = self._feeder
@@ -140,7 +149,7 @@ class Session:
         if self._publish and scenario.mavlink.links:
             live = self.order.paced and self.order.file is None
             network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early)
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, outlets.fixes)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:
@@ -159,8 +168,8 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
-        recorder = self._parts.get("recorder")
-        if self.outlets.stats["phase"] == Phase.STARTING or (recorder and "ready" not in recorder.answers):
+        writers = [part for name, part in self._parts.items() if name in {"recorder", "mcap"}]
+        if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in writers):
             return False
         if not self.outlets.control.go:
             self._began = time.monotonic()
@@ -254,13 +263,13 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher"):
+        for name in ("loop", "feeder", "recorder", "mcap", "publisher"):
             part = self._parts.get(name)
             if part is None:
                 continue
             if name == "publisher":
                 self._publisher_stop.call()
-            patience = RECORDER_STOP_S if name == "recorder" else 0.0
+            patience = RECORDER_STOP_S if name in {"recorder", "mcap"} else 0.0
             while part.process.is_alive() and time.monotonic() < deadline + patience:
                 part.read()
                 part.process.join(0.02)
@@ -285,7 +294,7 @@ class Session:
         result["wall_s"], result["device_s"] = wall, device_s
         result["speed"] = device_s / wall if wall else 0.0
         result["latency_us"] = stats.latency_us()
-        for name in ("loop", "feeder", "publisher", "recorder"):
+        for name in ("loop", "feeder", "publisher", "recorder", "mcap"):
             part = self._parts.get(name)
             if part is not None:
                 part.read()

@@ -14,6 +14,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.logs.tlog import TlogWriter
 from drivers.mavlink.commands import answer
+from drivers.mavlink.events import PACE_S, Happened, changes
+from drivers.mavlink.extra import CurrentEventSequence, Event
 from drivers.mavlink.link import Link
 from drivers.mavlink.messages import KINDS, Kind, Message
 from drivers.mavlink.options import LinkOptions
@@ -21,8 +23,8 @@ from drivers.mavlink.signing import Signer
 from drivers.mavlink.station import Station
 from nav.state import Health, Mode
 
-_ANNOUNCE_S = 0.5
-"""Shortest time between two announcements of mode or health: a flapping flag may not fill the link."""
+_EVENTS_S = 5.0
+"""How often the number of the newest event is told, for clients that have missed it."""
 _AGAIN_S = 0.5
 """When to look again at a link without a peer."""
 _TEXT = 50
@@ -30,23 +32,6 @@ _TEXT = 50
 _LONGEST_GAP = 128
 """A gap in a sequence as long as this is a sender that began anew, or one that repeats itself."""
 _MARKERS = (mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2)
-
-_MODE_TEXT = {
-    Mode.INIT: "Waiting for the sensor",
-    Mode.ALIGN: "Aligning: keep still",
-    Mode.NAVIGATE: "Navigating",
-    Mode.DEGRADED: "Navigation degraded",
-}
-_HEALTH_TEXT = {
-    Health.SILENT: (mav.MAV_SEVERITY_ERROR, "No samples from the sensor"),
-    Health.BRIDGED: (mav.MAV_SEVERITY_WARNING, "A gap in the samples was bridged"),
-    Health.SENSOR: (mav.MAV_SEVERITY_ERROR, "The sensor reports a fault"),
-    Health.MOVING: (mav.MAV_SEVERITY_NOTICE, "Alignment waits: the vehicle moves"),
-    Health.UNITS: (mav.MAV_SEVERITY_ERROR, "Specific force at rest is not 1 g"),
-    Health.RATE_TOO_SMALL: (mav.MAV_SEVERITY_WARNING, "Cannot find north: heading must be given"),
-    Health.SPARE: (mav.MAV_SEVERITY_WARNING, "A redundant instrument has failed"),
-    Health.UNAIDED: (mav.MAV_SEVERITY_NOTICE, "Position is not aided and drifts"),
-}
 
 
 @dataclass(slots=True)
@@ -113,12 +98,16 @@ class Endpoint:
         self._announced = (Mode.INIT, Health.GOOD)
         self._announce_s = -math.inf
         self._told = station.noted
+        self._event = station.events.count
+        self._event_s = -math.inf
         self._long_texts = 0
         station.on_rate.append(self._renew)
+        station.on_home.append(self._send_home)
 
     def close(self) -> None:
         """Take part in the station no longer."""
         self.station.on_rate.remove(self._renew)
+        self.station.on_home.remove(self._send_home)
 
     def poll(self, now_s: float) -> float:
         """Read what has arrived, answer it, send what is due; returns when to come again at the latest."""
@@ -127,9 +116,11 @@ class Endpoint:
         for message in self._parsed(data) if data else ():
             self._take(message)
         if not self.link.ready():
-            self.waits, self._told = False, self.station.noted
+            self.waits, self._told, self._event = False, self.station.noted, self.station.events.count
             return now_s + _AGAIN_S
         self._announce(now_s)
+        if not self.options.only:
+            self._send_events(now_s)
         return self._send_due(now_s)
 
     def send(self, message: Message) -> None:
@@ -151,6 +142,25 @@ class Endpoint:
         if message is not None:
             self.send(message)
         return message is not None
+
+    def _send_home(self) -> None:
+        if self.allows("HOME_POSITION"):
+            self.send_now("HOME_POSITION")
+
+    def send_event(self, happened: Happened) -> None:
+        """Send an event."""
+        level = happened.kind.severity << 4 | happened.kind.severity
+        numbers = happened.kind.number, happened.time_ms % 2**32, happened.sequence
+        self.send(Event(0, 0, *numbers, level, [0] * 40))
+
+    def _send_events(self, now_s: float) -> None:
+        events = self.station.events
+        for happened in events.since(self._event):
+            self.send_event(happened)
+        self._event = events.count
+        if events.count and now_s >= self._event_s:
+            self.send(CurrentEventSequence(events.newest, 0))
+            self._event_s = now_s + _EVENTS_S
 
     def interval_s(self, name: str) -> float:
         """Interval of message `name` on this link, s; 0 when it is off."""
@@ -253,26 +263,16 @@ class Endpoint:
             return
         mode, health = self.station.solution.mode, self.station.solution.health
         if (mode, health) != self._announced:
-            self._tell_change(mode, health)
+            for kind in changes(self._announced, (mode, health)):
+                self._say(kind.severity, kind.text)
+            self._announced = mode, health
         elif self._told < self.station.noted:
             notes, waiting = self.station.notes, min(self.station.noted - self._told, len(self.station.notes))
             self._say(*notes[-waiting])
             self._told = self.station.noted - waiting + 1
         else:
             return
-        self._announce_s = now_s + _ANNOUNCE_S
-
-    def _tell_change(self, mode: Mode, health: Health) -> None:
-        old_mode, old_health = self._announced
-        self._announced = mode, health
-        if mode != old_mode:
-            severity = mav.MAV_SEVERITY_WARNING if mode == Mode.DEGRADED else mav.MAV_SEVERITY_INFO
-            self._say(severity, _MODE_TEXT[mode])
-        for flag, (severity, text) in _HEALTH_TEXT.items():
-            if flag & health & ~old_health:
-                self._say(severity, text)
-            elif flag & old_health & ~health:
-                self._say(mav.MAV_SEVERITY_INFO, f"Over: {text}")
+        self._announce_s = now_s + PACE_S
 
     def _say(self, severity: int, text: str) -> None:
         """STATUSTEXT, of more than `_TEXT` characters in numbered pieces."""

@@ -1,5 +1,6 @@
 """Several links at once on real sockets: rates, filters, sequences, counters and logs of each; what one does to the others."""
 
+import itertools
 import re
 import socket
 import struct
@@ -73,7 +74,7 @@ class Peer:
     def gaps(self) -> int:
         assert "BAD_DATA" not in self.counts()
         numbers = [message.get_seq() for message in self.heard]
-        return sum((b - a) % 256 != 1 for a, b in zip(numbers, numbers[1:], strict=False))
+        return sum((b - a) % 256 != 1 for a, b in itertools.pairwise(numbers))
 
 
 def beat() -> Any:
@@ -239,7 +240,9 @@ def test_bytes_that_are_no_message_make_nobody_a_peer() -> None:
 
 def tool(name: str, *arguments: str) -> str:
     program = Path(sys.executable).parent / name
-    done = subprocess.run([sys.executable, str(program), *arguments], capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        [sys.executable, str(program), *arguments], capture_output=True, text=True, timeout=60, check=True
+    )
     return done.stdout + done.stderr
 
 
@@ -329,7 +332,9 @@ def test_a_log_is_on_the_disk_soon_and_a_full_disk_ends_the_log_alone(tmp_path: 
 
 
 def test_options_of_a_url() -> None:
-    found = parse_options("udpout:10.0.0.2:14550?rates_hz=ATTITUDE:100,VFR_HUD:0&only=ATTITUDE,VFR_HUD&hear=false&tlog=a.tlog")
+    found = parse_options(
+        "udpout:10.0.0.2:14550?rates_hz=ATTITUDE:100,VFR_HUD:0&only=ATTITUDE,VFR_HUD&hear=false&tlog=a.tlog"
+    )
     assert found == LinkOptions(
         "udpout:10.0.0.2:14550", {"ATTITUDE": 100.0, "VFR_HUD": 0.0}, ("ATTITUDE", "VFR_HUD"), False, True, "a.tlog"
     )
