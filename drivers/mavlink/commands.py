@@ -12,7 +12,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.events import KEPT
 from drivers.mavlink.extra import ComponentMetadata, ResponseEventError
-from drivers.mavlink.files import answers
 from drivers.mavlink.messages import KINDS, LONGEST_HEARTBEAT_S, SHORTEST_INTERVAL_S
 from drivers.mavlink.metadata import GENERAL, checksum, uri
 from drivers.mavlink.solution import Home
@@ -128,6 +127,7 @@ def _request_message(params: list[float], endpoint: "Endpoint") -> int:
         return _request_version(params, endpoint)
     if params[0] == ComponentMetadata.id:
         general = endpoint.station.files[GENERAL]
+        endpoint.wants_events = True  # whose words are in those files
         boot_ms = endpoint.station.device_ns() // 1_000_000 % 2**32
         endpoint.send(ComponentMetadata(boot_ms, checksum(general), uri(GENERAL).encode()))
         return int(mav.MAV_RESULT_ACCEPTED)
@@ -270,12 +270,13 @@ def _setup_signing(_: Any, endpoint: "Endpoint") -> None:
 
 def _ftp(message: Any, endpoint: "Endpoint") -> None:
     sender = message.get_srcSystem(), message.get_srcComponent()
-    for payload in answers(bytes(message.payload), endpoint.station.files):
+    for payload in endpoint.files.answers(bytes(message.payload), sender):
         endpoint.send(mav.MAVLink_file_transfer_protocol_message(0, *sender, payload))
 
 
 def _request_event(message: Any, endpoint: "Endpoint") -> None:
     """Events that a client has missed; the first that is there no longer is told with the oldest that is."""
+    endpoint.wants_events = True
     events = endpoint.station.events
     wanted = (message.last_sequence - message.first_sequence) % 65536 + 1
     for sequence in ((message.first_sequence + i) % 65536 for i in range(min(wanted, KEPT))):

@@ -16,6 +16,7 @@ from drivers.logs.tlog import TlogWriter
 from drivers.mavlink.commands import answer
 from drivers.mavlink.events import PACE_S, Happened, changes
 from drivers.mavlink.extra import CurrentEventSequence, Event
+from drivers.mavlink.files import FileServer
 from drivers.mavlink.link import Link
 from drivers.mavlink.messages import KINDS, Kind, Message
 from drivers.mavlink.options import LinkOptions
@@ -98,6 +99,9 @@ class Endpoint:
         self._announced = (Mode.INIT, Health.GOOD)
         self._announce_s = -math.inf
         self._told = station.noted
+        self.files = FileServer(station.files)
+        self.wants_events = False
+        """Whether a client has shown that it knows events: to one that does not, they look like losses."""
         self._event = station.events.count
         self._event_s = -math.inf
         self._long_texts = 0
@@ -119,7 +123,7 @@ class Endpoint:
             self.waits, self._told, self._event = False, self.station.noted, self.station.events.count
             return now_s + _AGAIN_S
         self._announce(now_s)
-        if not self.options.only:
+        if self.wants_events:
             self._send_events(now_s)
         return self._send_due(now_s)
 

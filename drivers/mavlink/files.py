@@ -1,7 +1,7 @@
 """MAVLink FTP for files that are read and never change: a few kilobytes of metadata, from memory.
 
-The number of a session is that of its file, so that nothing is held for a client that goes away. Nothing can be written, and
-nothing of the disk can be reached.
+Each client has one session, number 0, which is all that some of them can use. Nothing can be written, and nothing of the disk
+can be reached.
 """
 
 import struct
@@ -22,18 +22,41 @@ _WRITING = (6, 7, 8, 9, 10, 11, 12, 13)
 PAYLOAD = 251
 
 
-def answers(request: bytes, files: Mapping[str, bytes]) -> Iterator[bytes]:
-    """The payloads that answer the payload of a request; none for one that is no request."""
+_CLIENTS = 16
+"""Clients whose open file is remembered."""
+
+
+class FileServer:
+    """The files, and which of them each client has open."""
+
+    def __init__(self, files: Mapping[str, bytes]) -> None:
+        self._files = files
+        self._open: dict[tuple[int, int], str] = {}
+
+    def answers(self, request: bytes, sender: tuple[int, int]) -> Iterator[bytes]:
+        """The payloads that answer the payload of a request; none for one that is no request."""
+        opcode, name = request[3], _path(request)
+        if opcode == _OPEN and name in self._files:
+            self._open.pop(sender, None)
+            self._open[sender] = name
+            if len(self._open) > _CLIENTS:
+                del self._open[next(iter(self._open))]
+        return _answers(request, self._files, self._files.get(self._open.get(sender, "")))
+
+
+def _path(request: bytes) -> str:
+    return request[_HEAD.size : _HEAD.size + request[4]].split(b"\0")[0].decode("ascii", "replace").strip("/")
+
+
+def _answers(request: bytes, files: Mapping[str, bytes], body: bytes | None) -> Iterator[bytes]:
+    """`body` is what the client has open."""
     number, session, opcode, size, _, _, offset = _HEAD.unpack_from(request)
-    data = request[_HEAD.size : _HEAD.size + size]
     if opcode in (0, _ACK, _NAK):
         return
-    names = list(files)
-    body = files[names[session]] if session < len(names) else None
-    path = data.split(b"\0")[0].decode("ascii", "replace").strip("/")
+    path = _path(request)
 
-    def reply(content: bytes, *, at: int = offset, more: int = 1, held: int = session, complete: int = 0) -> bytes:
-        head = _HEAD.pack((number + more) % 65536, held, _ACK, len(content), opcode, complete, at)
+    def reply(content: bytes, *, at: int = offset, more: int = 1, complete: int = 0) -> bytes:
+        head = _HEAD.pack((number + more) % 65536, session, _ACK, len(content), opcode, complete, at)
         return (head + content).ljust(PAYLOAD, b"\0")
 
     def refusal(reason: int) -> bytes:
@@ -54,11 +77,11 @@ def answers(request: bytes, files: Mapping[str, bytes]) -> Iterator[bytes]:
         if path not in files:
             yield refusal(_NOT_FOUND)
         elif opcode == _OPEN:
-            yield reply(struct.pack("<I", len(files[path])), held=names.index(path))
+            yield reply(struct.pack("<I", len(files[path])))
         else:
             yield reply(struct.pack("<I", checksum(files[path])))
     elif opcode in (_READ, _BURST_READ):
-        if body is None:
+        if body is None or session != 0:
             yield refusal(_NO_SESSION)
         elif offset >= len(body):
             yield refusal(_EOF)

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from drivers.mavlink import extra
 from drivers.mavlink.endpoint import Endpoint
 from drivers.mavlink.events import EVENTS, KEPT, PACE_S
-from drivers.mavlink.files import DATA, PAYLOAD, answers
+from drivers.mavlink.files import DATA, PAYLOAD, FileServer
 from drivers.mavlink.intake import Intake
 from drivers.mavlink.messages import FIX_S, gps_raw_int, heartbeat
 from drivers.mavlink.metadata import checksum
@@ -72,6 +72,7 @@ class Desk:
         self.row, self.now_s = np.zeros(1, NAV_STATE), 10.0
         self.row["mode"], self.row["q_nb"], self.row["sigma"] = Mode.NAVIGATE, (1.0, 0.0, 0.0, 0.0), np.inf
         self.row["lat"], self.row["lon"], self.row["height"] = 0.87, 0.63, 150.0
+        self.endpoint.wants_events = True
         self.tick()
 
     def tick(self, step_s: float = 1.0, **fields: Any) -> list[Any]:
@@ -231,10 +232,10 @@ def request(opcode: int, path: str = "", *, session: int = 0, offset: int = 0, s
     return (head + data).ljust(PAYLOAD, b"\0")
 
 
-def replies(files: dict[str, bytes], *arguments: Any, **more: Any) -> list[tuple[int, int, int, int, int, bytes]]:
+def replies(server: FileServer, *arguments: Any, **more: Any) -> list[tuple[int, int, int, int, int, bytes]]:
     """(number, session, opcode, complete, offset, data) of each."""
     found = []
-    for payload in answers(request(*arguments, **more), files):
+    for payload in server.answers(request(*arguments, **more), (255, 190)):
         assert len(payload) == PAYLOAD
         number, session, opcode, size, asked, complete, offset = struct.unpack_from("<HBBBBBxI", payload)
         assert asked == arguments[0]
@@ -242,7 +243,7 @@ def replies(files: dict[str, bytes], *arguments: Any, **more: Any) -> list[tuple
     return found
 
 
-def fetched(files: dict[str, bytes], name: str) -> bytes:
+def fetched(files: FileServer, name: str) -> bytes:
     ((_, session, opcode, _, _, size),) = replies(files, OPEN, name)
     assert opcode == ACK
     body = b""
@@ -267,7 +268,7 @@ def test_metadata_describe_every_parameter_and_event() -> None:
     desk = Desk()
     answer = desk.ask(mav.MAVLink_command_long_message(1, 1, mav.MAV_CMD_REQUEST_MESSAGE, 0, 397, 0, 0, 0, 0, 0, 0))
     general = the(answer, "COMPONENT_METADATA")
-    files = desk.station.files
+    files = FileServer(desk.station.files)
     name = re.fullmatch(r"mftp:///(.+)", general.uri.decode())
     assert name is not None
     body = fetched(files, name[1])
@@ -276,7 +277,7 @@ def test_metadata_describe_every_parameter_and_event() -> None:
     assert set(listed) == {1, 4}
     for entry in listed.values():
         assert checksum(fetched(files, entry["uri"].removeprefix("mftp:///"))) == entry["fileCrc"]
-    rows = json.loads(files["parameters.json"])["parameters"]
+    rows = json.loads(desk.station.files["parameters.json"])["parameters"]
     sent = {
         m.param_id: m for m in desk.ask(mav.MAVLink_param_request_list_message(1, 1)) if m.get_type() == "PARAM_VALUE"
     }
@@ -286,7 +287,7 @@ def test_metadata_describe_every_parameter_and_event() -> None:
         if "max" in row:
             assert put(desk, row["name"].encode(), row["max"]) == row["max"]
             assert put(desk, row["name"].encode(), row["max"] + 1.0) == row["max"]
-    events = json.loads(files["events.json"])["components"]["1"]["event_groups"]["default"]["events"]
+    events = json.loads(desk.station.files["events.json"])["components"]["1"]["event_groups"]["default"]["events"]
     assert {int(number) + (1 << 24) for number in events} == {kind.number for kind in EVENTS}
     assert len({kind.name for kind in EVENTS}) == len(EVENTS)
 
@@ -303,7 +304,7 @@ def test_checksum_is_that_of_the_protocol() -> None:
 
 
 def test_nothing_can_be_written_or_reached_beside_the_files() -> None:
-    files = {"a.json": b"{}"}
+    files = FileServer({"a.json": b"{}"})
     for path in ("/etc/passwd", "../a.json", "b.json", "", "@SYS/x"):
         assert replies(files, OPEN, path)[0][2] == NAK
     for opcode in (6, 7, 8, 9, 10, 11, 12, 13):
@@ -314,9 +315,18 @@ def test_nothing_can_be_written_or_reached_beside_the_files() -> None:
     assert replies(files, READ, session=9)[0][5] == b"\x04"
 
 
+def test_each_client_reads_its_own_file_and_few_are_remembered() -> None:
+    server = FileServer({"a": b"A", "b": b"B"})
+    for system in range(1, 30):
+        list(server.answers(request(OPEN, "ab"[system % 2]), (system, 1)))
+    for system, expected in ((29, b"B"), (28, b"A"), (1, b"\x04")):
+        (payload,) = server.answers(request(READ, size=DATA), (system, 1))
+        assert payload[12:13] == expected
+
+
 @given(st.binary(min_size=PAYLOAD, max_size=PAYLOAD))
 def test_any_request_is_survived(payload: bytes) -> None:
-    assert all(len(answer) == PAYLOAD for answer in answers(payload, {"a": b"x" * 10000}))
+    assert all(len(answer) == PAYLOAD for answer in FileServer({"a": b"x" * 10000}).answers(payload, (1, 1)))
 
 
 def events_in(messages: list[Any]) -> list[Any]:
@@ -344,6 +354,16 @@ def test_events_are_numbered_and_can_be_asked_for_again() -> None:
     )
     assert len(oldest) == 1
     assert the(desk.tick(step_s=6.0), "CURRENT_EVENT_SEQUENCE").sequence == desk.station.events.newest
+
+
+def test_events_go_to_those_who_know_them() -> None:
+    """To others they look like losses: their parsers pass over them."""
+    desk = Desk()
+    desk.endpoint.wants_events = False
+    shown = desk.tick(step_s=6.0, health=Health.SENSOR)
+    assert not {"EVENT", "CURRENT_EVENT_SEQUENCE"} & {message.get_type() for message in shown}
+    desk.command(mav.MAV_CMD_REQUEST_MESSAGE, extra.ComponentMetadata.id, 0, 0, 0, 0, 0, 0)
+    assert events_in(desk.tick(health=0))
 
 
 def test_a_flapping_flag_does_not_fill_the_events() -> None:
