@@ -30,6 +30,7 @@ from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
 from hil.control import Control
 from hil.magnetometer import correct
+from hil.other_attitude import Estimator, OtherAttitude
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
@@ -143,6 +144,7 @@ class Loop:
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
         self._reference = order.reference
+        self._other = OtherAttitude(self.driver) if isinstance(self.driver, Estimator) else None
         self._keep_trace = order.keep_trace
         self._clock = ClockMap()
         self._restarts = 0
@@ -328,6 +330,8 @@ class Loop:
                 outlets.stats["position_error_mm"] = round(min(self._truth.position.final, 1e12) * 1000.0)
         if self._trace is not None:
             self._trace.add(rows)
+        if self._other is not None and len(rows):
+            self._other.compare(rows)
 
     def _count(self) -> None:
         counters = self.driver.counters
@@ -345,6 +349,8 @@ class Loop:
             "failed_axes": self._combiner.failed(),
             "aiding": {kind.name: count for kind, count in self._aiding.heard.items() if count},
         }
+        if self._other is not None:
+            result["other_attitude"] = self._other.summary()
         if self._withheld:
             result["withheld"] = self._withheld
         if self._aiding.counters.frames:

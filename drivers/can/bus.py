@@ -1,7 +1,8 @@
 """Opening a bus by URL: the bulk interface that the bridge, the head and the tools use on every CAN back end.
 
 ``unix:NAME`` (:mod:`drivers.can.unix_bus`), ``socketcan:vcan0`` (:mod:`drivers.can.socketcan`) and
-``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own; anything else is python-can: ``virtual:NAME``,
+``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own,
+as is ``mavlink:LINK`` (:mod:`drivers.mavlink.port`); anything else is python-can: ``virtual:NAME``,
 ``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
 """
 
@@ -70,6 +71,10 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
         from drivers.serial.port import SerialPort
 
         return SerialPort(url)
+    if interface == "mavlink":
+        from drivers.mavlink.port import MavlinkPort
+
+        return MavlinkPort(rest)
     if interface == "socketcan" and not query:
         return SocketCanPort(channel, listen=listen)
     options = {key: _typed(value) for key, value in parse_qsl(query, keep_blank_values=True)}
