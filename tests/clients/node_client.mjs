@@ -64,6 +64,12 @@ packets.on('data', packet => {
   if (!asked && Date.now() - began > 300) ask()
 })
 
-socket.on('message', (data, from) => { peer = from; bytes.write(data) })
+function end() { console.log(JSON.stringify(result)); process.exit(0) }
+
+socket.on('message', (data, from) => {
+  if (!peer) { began = Date.now(); setTimeout(end, 1000 * Number(seconds)) }
+  peer = from
+  bytes.write(data)
+})
 socket.bind(Number(port), '127.0.0.1')
-setTimeout(() => { console.log(JSON.stringify(result)); process.exit(0) }, 1000 * Number(seconds))
+setTimeout(end, 1000 * (Number(seconds) + 60)) // nothing has come

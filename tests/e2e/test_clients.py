@@ -143,7 +143,7 @@ def test_node_mavlink_loses_nothing(node: list[str], key: Path, signed: bool) ->
     port = free_port()
     config: dict[str, Any] = {"signing_key": str(key)} if signed else {}
     bridge = Bridge(f"udpout:127.0.0.1:{port}", rates_hz=FAST, keep_parameters=False, **config)
-    found = said([*node, str(port), str(SECONDS), *([key.read_text()] if signed else [])], SECONDS + 60.0)
+    found = said([*node, str(port), str(SECONDS), *([key.read_text()] if signed else [])], SECONDS + 90.0)
     counters = bridge.end()
     total = sum(found["heard"].values())
     print(f"{total / SECONDS:.0f} messages a second, {found['lost']} lost")
@@ -154,7 +154,6 @@ def test_node_mavlink_loses_nothing(node: list[str], key: Path, signed: bool) ->
     assert found["parameters"]["SR_HUD_HZ"] == 7.0
     assert len(found["parameters"]) == 18
     assert (found["acks"]["511"], found["acks"]["512"]) == (0, 0)
-    assert found["heard"]["AUTOPILOT_VERSION"] == 1
     assert found["wrong"] == 0
     assert (found["signed"] > 0.9 * total) == signed
     assert counters["refused"] == {}
@@ -183,6 +182,7 @@ def mavproxy(tmp_path: Path, port: int, script: list[tuple[float, str]]) -> str:
             time.sleep(pause_s)
             proxy.stdin.write(line + "\n")
             proxy.stdin.flush()
+        proxy.stdin.close()
         proxy.wait(timeout=60.0)
     found = printed.read_text()
     print(found)

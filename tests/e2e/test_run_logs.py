@@ -1,4 +1,4 @@
-"""Logs of a run that is ended in every way: by itself, by Ctrl-C, by SIGTERM, by a kill of the command, by a kill of the writer."""
+"""Logs of a run that is ended by Ctrl-C, by SIGTERM, by a kill of the command, by a kill of the writer."""
 
 import os
 import signal
@@ -20,7 +20,18 @@ HIL = [sys.executable, "-c", "from hil.cli import main; main()"]
 
 def begun(path: Path, tlog: Path) -> "subprocess.Popen[str]":
     """A run whose files have begun to grow."""
-    command = [*HIL, "run", "rest", "--mavlink", "udpout:127.0.0.1:9", "--tlog", str(tlog), "--mcap", str(path), "--json"]
+    command = [
+        *HIL,
+        "run",
+        "rest",
+        "--mavlink",
+        "udpout:127.0.0.1:9",
+        "--tlog",
+        str(tlog),
+        "--mcap",
+        str(path),
+        "--json",
+    ]
     run = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 180.0
     while (not path.exists() or path.stat().st_size < 60_000) and time.monotonic() < deadline:
