@@ -33,8 +33,8 @@ lint: .venv/.installed-dev
 dev: .venv/.installed-dev
 
 .venv/.installed-run: EXTRAS = logs
-.venv/.installed-test: EXTRAS = logs,plot,magnetic,test
-.venv/.installed-dev: EXTRAS = logs,plot,magnetic,test,dev
+.venv/.installed-test: EXTRAS = logs,plot,magnetic,mcap,test
+.venv/.installed-dev: EXTRAS = logs,plot,magnetic,mcap,test,dev
 
 .venv/.installed-%: pyproject.toml constraints.txt | .venv/bin/pip
 	@echo "Installing dtg-hil[$(EXTRAS)] into .venv (takes a minute or so the first time) ..."

@@ -154,7 +154,11 @@ def _board(device: str) -> Finding:
 
 
 def _extras() -> Iterator[Finding]:
-    for module, what, extra in (("pyulog", "PX4 logs", "logs"), ("matplotlib", "plots", "plot")):
+    for module, what, extra in (
+        ("pyulog", "PX4 logs", "logs"),
+        ("matplotlib", "plots", "plot"),
+        ("mcap", "MCAP files", "mcap"),
+    ):
         there = importlib.util.find_spec(module) is not None
         mend = "" if there else f"pip install 'dtg-hil[{extra}]'"
         yield Finding(what, "ok" if there else "lack", module if there else f"{module} is not installed", mend)

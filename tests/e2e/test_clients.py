@@ -39,6 +39,8 @@ FAST = dict.fromkeys(
     250.0,
 )
 """More than 500 messages a second, on a machine that has little time for the test too."""
+STEADY = {"ATTITUDE": 220.0, "HIGHRES_IMU": 220.0}
+"""With the other built-in rates 530 messages a second."""
 PASSPHRASE = "passphrase-of-the-test"
 pytestmark = [pytest.mark.slow]
 
@@ -201,7 +203,7 @@ def tool(name: str, *arguments: str) -> str:
 def test_mavproxy_and_the_log_tools_find_no_loss(tmp_path: Path) -> None:
     pytest.importorskip("MAVProxy")
     port, log = free_port(), tmp_path / "bridge.tlog"
-    bridge = Bridge(f"udpout:127.0.0.1:{port}?tlog={log}", rates_hz=FAST, keep_parameters=False)
+    bridge = Bridge(f"udpout:127.0.0.1:{port}?tlog={log}", rates_hz=STEADY, keep_parameters=False)
     output = mavproxy(tmp_path, port, [(SECONDS, "link"), (2.0, "exit")])
     counters = bridge.end()
     assert "link 1 OK" in output
