@@ -49,6 +49,8 @@ dev: .venv/.installed-dev
 .venv/.installed-test: EXTRAS = logs,plot,magnetic,test
 .venv/.installed-fuzz: EXTRAS = logs,magnetic,test,fuzz
 .venv/.installed-dev: EXTRAS = logs,plot,magnetic,test,dev
+.venv/.installed-test: EXTRAS = logs,plot,magnetic,mcap,test
+.venv/.installed-dev: EXTRAS = logs,plot,magnetic,mcap,test,dev
 
 .venv/.installed-%: pyproject.toml constraints.txt | .venv/bin/pip
 	@echo "Installing dtg-hil[$(EXTRAS)] into .venv (takes a minute or so the first time) ..."

@@ -31,6 +31,7 @@ from hil.calibration import NO_HEAD, validated
 from hil.clock import LoopClock
 from hil.control import Control
 from hil.magnetometer import correct
+from hil.other_attitude import Estimator, OtherAttitude
 from hil.realtime import claim
 from hil.reference import Reference, Trace
 from hil.ring import Ring
@@ -42,7 +43,7 @@ from hil.warmup import warm_loop
 from hil.wire_watch import WireWatch
 from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
-from nav.aiding import Kind
+from nav.aiding import AIDING, Kind, of_receivers
 from nav.errors import HilError
 from nav.filter.record import Recorder
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
@@ -105,6 +106,8 @@ class Outlets:
     events: Ring
     aiding: tuple[Ring, ...]
     """Frames of measurements, a ring a writer: that of the publisher, then those of the receivers."""
+    fixes: Ring
+    """What receivers have measured, for the publisher."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
     recording: bool = False
@@ -119,6 +122,7 @@ class Outlets:
             Ring(FRAME, 1 << 16, 1),
             Ring(EVENTS, 256, 1),
             tuple(Ring(FRAME, 1024, 0) for _ in range(1 + receivers)),
+            Ring(AIDING, 64, 0),
             recording=recording,
         )
 
@@ -155,6 +159,7 @@ class Loop:
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
         self._reference = order.reference
+        self._other = OtherAttitude(self.driver) if isinstance(self.driver, Estimator) else None
         self._keep_trace = order.keep_trace
         self._clock = LoopClock(outlets.stats, partial(self.navigator.tell, station=True))
         self._restarts = 0
@@ -181,6 +186,8 @@ class Loop:
         rows, places = self._aiding.decode(batch, self._now)
         if self._magnetometer is not None:
             correct(self._magnetometer, rows)
+        if (fixes := of_receivers(rows)).any():
+            self._outlets.fixes.push(rows[fixes])
         cuts = np.flatnonzero(aided[1:] & ~aided[:-1]) + 1
         got, start, taken = False, 0, 0
         for stop in (*cuts.tolist(), len(batch)):
@@ -334,6 +341,8 @@ class Loop:
                 outlets.stats["position_error_mm"] = round(min(self._truth.position.final, 1e12) * 1000.0)
         if self._trace is not None:
             self._trace.add(rows)
+        if self._other is not None and len(rows):
+            self._other.compare(rows)
 
     def _count(self, batch: FrameArray) -> None:
         counters = self.driver.counters
@@ -366,6 +375,8 @@ class Loop:
         }
         if errors := self._watch.errors.as_dict():
             result["bus_errors"] = errors
+        if self._other is not None:
+            result["other_attitude"] = self._other.summary()
         if self._withheld:
             result["withheld"] = self._withheld
         if self._aiding.counters.frames:

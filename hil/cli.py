@@ -17,6 +17,7 @@ from nav.errors import HilError
 
 if TYPE_CHECKING:
     from hil.bridge import LoopOrder
+    from hil.scenario import Scenario
     from hil.session import Session
 
 COMMON_BUS = "unix:dtg-hil"
@@ -42,6 +43,11 @@ Links = Annotated[
     list[str] | None,
     typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
+Key = Annotated[
+    Path | None, typer.Option("--mavlink-key", help="Sign MAVLink with the key in this file, take nothing unsigned.")
+]
+Tlog = Annotated[Path | None, typer.Option(help="Log the first MAVLink link to this file (.tlog).")]
+Mcap = Annotated[Path | None, typer.Option(help="Write solutions and events for Foxglove to this file (.mcap).")]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
 Realtime = Annotated[
     bool, typer.Option("--realtime", help="Priority, locked memory and a processor for the loop, where permitted.")
@@ -67,6 +73,9 @@ def run(
     seed: Seed = None,
     record: Record = None,
     realtime: Realtime = False,
+    mavlink_key: Key = None,
+    tlog: Tlog = None,
+    mcap: Mcap = None,
     assertion: Asserts = None,
     junit: Junit = None,
     no_dashboard: Annotated[
@@ -86,6 +95,7 @@ def run(
     )
     if gnss:
         chosen = chosen.with_receivers(gnss)
+    chosen = _links(chosen, mavlink_key, tlog)
     outside = bool(chosen.bus) or imu is not None
     if outside and not _paced(speed):
         raise HilError(
@@ -109,7 +119,7 @@ def run(
         own_world=not outside,
         realtime=realtime,
     )
-    _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
+    _run(order, None if outside else simulated_head(order), record, assertion, junit, mcap=mcap, as_json=as_json)
 
 
 @app.command()
@@ -147,6 +157,9 @@ def replay(
     speed: Speed = "1",
     record: Record = None,
     realtime: Realtime = False,
+    mavlink_key: Key = None,
+    tlog: Tlog = None,
+    mcap: Mcap = None,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
     withhold: Annotated[
         list[str] | None,
@@ -166,7 +179,7 @@ def replay(
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
     changed = order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold))
-    order = replace(order, scenario=changed, realtime=realtime)
+    order = replace(order, scenario=_links(changed, mavlink_key, tlog), realtime=realtime)
     if plot is not None:
         if order.reference is None:
             raise HilError(f"--plot: {log} carries no attitude to compare with")
@@ -183,7 +196,7 @@ def replay(
 
         return {"smoothed": smooth_recording(log, order.scenario, smooth)}
 
-    summary = _run(order, feeder, record, assertion, junit, smoothed, as_json=as_json)
+    summary = _run(order, feeder, record, assertion, junit, smoothed, mcap=mcap, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -258,13 +271,18 @@ def decode(
 @app.command()
 def export(
     file: Annotated[Path, typer.Argument(help="Recording of frames.")],
-    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet.")],
+    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet; or .mcap.")],
     imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the samples of a recording as a table, a column a signal."""
+    """Write the samples of a recording as a table, a column a signal; or its navigation for Foxglove (.mcap)."""
     import numpy as np
 
+    if out.suffix == ".mcap":
+        from hil.mcap_recorder import export_mcap
+
+        _report(export_mcap(file, imu, out), as_json=as_json)
+        return
     from hil.samples import read_samples
     from hil.tables import write_table
 
@@ -528,6 +546,7 @@ def _run(
     junit: Path | None,
     more: Callable[[], dict[str, Any]] = dict,
     *,
+    mcap: Path | None = None,
     as_json: bool,
 ) -> dict[str, Any]:
     """Run a session to its end, show it with what `more` adds, check the assertions; the summary."""
@@ -539,7 +558,7 @@ def _run(
     if junit is not None and not checks:
         raise HilError("--junit needs at least one --assert")
     stop = StopSignal()
-    session = Session(order, feeder=feeder, record=record_to)
+    session = Session(order, feeder=feeder, record=record_to, mcap=mcap)
     with session, RunView(session) as view:
         while not (session.ready or stop.wanted):
             view.show_compiling()
@@ -595,6 +614,15 @@ def _paced(speed: str) -> bool:
     if speed not in {"1", "max"}:
         raise HilError(f"--speed {speed}: expected 1 or max")
     return speed == "1"
+
+
+def _links(scenario: "Scenario", key: Path | None, tlog: Path | None) -> "Scenario":
+    from hil.cli_mavlink import open_doors, with_mavlink
+
+    chosen = with_mavlink(scenario, key, tlog)
+    for line in open_doors(chosen):
+        _say(line)
+    return chosen
 
 
 def _changes(mavlink: list[str] | None = None, withhold: list[str] | None = None, **options: Any) -> dict[str, Any]:

@@ -188,8 +188,12 @@ def _board(device: str) -> Finding:
 
 
 def _extras() -> Iterator[Finding]:
-    extras = ("pyulog", "PX4 logs", "logs"), ("matplotlib", "plots", "plot"), ("pyarrow", "Parquet tables", "parquet")
-    for module, what, extra in extras:
+    for module, what, extra in (
+        ("pyulog", "PX4 logs", "logs"),
+        ("matplotlib", "plots", "plot"),
+        ("pyarrow", "Parquet tables", "parquet"),
+        ("mcap", "MCAP files", "mcap"),
+    ):
         there = importlib.util.find_spec(module) is not None
         mend = "" if there else f"pip install 'dtg-hil[{extra}]'"
         yield Finding(what, "ok" if there else "lack", module if there else f"{module} is not installed", mend)

@@ -398,10 +398,26 @@ class NavigationConfig(_Model):
         return self
 
 
+class LinkConfig(_Model):
+    """A MAVLink link with options of its own."""
+
+    url: str
+    rates_hz: Mapping[str, NotNegative] = Field(default_factory=dict)
+    """Message name to rate, over those of all links."""
+    only: tuple[str, ...] = ()
+    """Messages that may go out here; none named: all."""
+    hear: bool = True
+    """False: what comes in is neither answered nor obeyed."""
+    sign: bool = True
+    """False: without signatures where there is a key."""
+    tlog: str = ""
+    """File for what is sent and received."""
+
+
 class MavlinkConfig(_Model):
     """Where and how often the solution goes out as MAVLink."""
 
-    links: tuple[str, ...] = ("udpout:127.0.0.1:14550",)
+    links: tuple[str | LinkConfig, ...] = ("udpout:127.0.0.1:14550",)
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     component_id: Annotated[int, Field(ge=1, le=255)] = 1
     vehicle: Literal["fixed-wing", "quadrotor", "helicopter", "ground-rover", "surface-boat", "generic"] = "fixed-wing"
@@ -409,12 +425,20 @@ class MavlinkConfig(_Model):
     """Message name to rate, over the built-in rates; 0 switches a message off."""
     aiding: bool = False
     """Take measurements from the network."""
+    operator: bool = False
+    """Take position and heading from a person at a ground station."""
     aiding_from: tuple[Annotated[int, Field(ge=1, le=255)], ...] = (255,)
-    """Systems that may send them."""
+    """Systems that may send measurements, position, heading and home."""
     aiding_delay_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """How old they are when they come."""
     master: tuple[Annotated[int, Field(ge=1, le=255)], Annotated[int, Field(ge=1, le=255)]] | None = None
     """System and component of another inertial system, whose position, velocity and attitude are taken."""
+    signing_key: str = ""
+    """File of the key; empty: nothing is signed."""
+    accept_unsigned: tuple[str, ...] = ()
+    """Messages that are taken without a signature."""
+    keep_parameters: bool = True
+    """What a ground station sets holds in later runs."""
 
 
 class Scenario(_Model):

@@ -23,6 +23,7 @@ from drivers.utc import PulseClock
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.clock import clock_summary
 from hil.control import READERS, run_part
+from hil.mcap_recorder import run_mcap
 from hil.publisher import Taps, run_publisher
 from hil.receiver import run_receiver
 from hil.recorder import run_recorder
@@ -83,6 +84,8 @@ class Session:
         Recording to write.
     publish : bool
         Send MAVLink on the links of the scenario.
+    mcap : Path, optional
+        File for Foxglove to write; in real time only.
     """
 
     def __init__(
@@ -92,13 +95,17 @@ class Session:
         feeder: tuple[Callable[..., None], Sequence[Any]] | None = None,
         record: Path | None = None,
         publish: bool = True,
+        mcap: Path | None = None,
     ) -> None:
+        if mcap is not None and not order.paced:
+            raise HilError("--mcap needs real time: record the run with --record FILE, then `hil export FILE out.mcap`")
         self.order = order
         self._receivers = {f"receiver {k}": one for k, one in enumerate(order.scenario.receiver if order.live else ())}
         self.outlets = Outlets.make(recording=record is not None, readers=1, receivers=len(self._receivers))
         self._feeder = feeder
         self._record = record
         self._publish = publish
+        self._mcap = mcap
         self._publisher_stop = Wake()
         self._parts: dict[str, _Part] = {}
         self._event_number = 0
@@ -136,7 +143,7 @@ class Session:
 
         def launch(name: str, target: Callable[..., None], *args: Any) -> None:
             ours, theirs = context.Pipe()
-            nice = PUBLISHER_NICE if name == "publisher" else 0
+            nice = PUBLISHER_NICE if name in {"publisher", "mcap"} else 0
             aside = self.order.realtime and name != "loop"
             process = context.Process(
                 target=run_part,
@@ -151,13 +158,17 @@ class Session:
         if self._record is not None:
             header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
             launch("recorder", run_recorder, self._record, header, outlets)
+        if self._mcap is not None:
+            launch("mcap", run_mcap, self._mcap, outlets)
         launch("loop", run_loop, self.order, outlets)
         if self._feeder is not None:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
         if self._publish and scenario.mavlink.links:
             network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, outlets.stats)
+            taps = Taps(
+                outlets.states, 0, outlets.events, outlets.control, network, early, outlets.stats, outlets.fixes
+            )
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
         for k, (name, config) in enumerate(self._receivers.items()):
             launch(name, run_receiver, config, k, outlets.stats, outlets.aiding[1 + k], outlets.control)
@@ -178,7 +189,7 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
-        heralds = [part for name, part in self._parts.items() if name == "recorder" or name in self._receivers]
+        heralds = [part for name, part in self._parts.items() if name in {"recorder", "mcap", *self._receivers}]
         if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in heralds):
             return False
         if not self.outlets.control.go:
@@ -306,13 +317,13 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher", *self._receivers):
+        for name in ("loop", "feeder", "recorder", "mcap", "publisher", *self._receivers):
             part = self._parts.get(name)
             if part is None:
                 continue
             if name == "publisher":
                 self._publisher_stop.call()
-            patience = RECORDER_STOP_S if name == "recorder" else 0.0
+            patience = RECORDER_STOP_S if name in {"recorder", "mcap"} else 0.0
             while part.process.is_alive() and time.monotonic() < deadline + patience:
                 part.read()
                 part.process.join(0.02)
@@ -349,7 +360,7 @@ class Session:
             result["clock"] = clock
             if (utc := self._pulses.summary()) is not None:
                 clock["utc"] = utc
-        for name in ("loop", "feeder", "publisher", "recorder"):
+        for name in ("loop", "feeder", "publisher", "recorder", "mcap"):
             if name in self._parts:
                 answers = self._answers(name)
                 if name == "loop":

@@ -36,7 +36,7 @@ def smooth_recording(path: Path, scenario: Scenario, out: Path) -> dict[str, Any
     scenario = scenario.with_changes(navigation={"aided": True})
     recorder = Recorder()
     loop = Loop(LoopOrder(scenario, file=path, paced=False), Outlets.make(recording=False, readers=1), recorder)
-    for batch in _batches(path):
+    for batch in batches(path):
         take_with_events(loop, batch)
         if loop.finished:
             break
@@ -60,7 +60,8 @@ def smooth_recording(path: Path, scenario: Scenario, out: Path) -> dict[str, Any
     return report
 
 
-def _batches(path: Path) -> Iterator[FrameArray]:
+def batches(path: Path) -> Iterator[FrameArray]:
+    """The frames of a recording or a flight log, events among them, for a loop without a bus; each valid until the next."""
     if is_flight_log(path):
         for _, batch in timed(path, one_by_one=False):
             yield batch

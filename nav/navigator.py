@@ -12,10 +12,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from nav.aiding import OPERATOR, Kind
 from nav.alignment import rest
 from nav.alignment.chain import aligner, check_grade
 from nav.alignment.plan import GIVEN_UP, Plan, Start, Way, Word
 from nav.alignment.rest import UNSTATED, Sensors
+from nav.earth import curvature_radii
 from nav.errors import HilError
 from nav.filter.aided import AidedNavigator
 from nav.filter.aided import Settings as FilterSettings
@@ -208,22 +210,47 @@ class Navigator:
     def aid(self, rows: NDArray[Any]) -> None:
         """Take measurements (:data:`nav.aiding.AIDING`): for the alignment, then for the filter, if there is one.
 
+        Without a filter an operator's position and heading are taken as they are, and nothing else is.
+
         Raises
         ------
         HilError
             A value or a standard deviation that is used is no number.
         """
         if self.mode == Mode.ALIGN:
-            if not (
-                np.isfinite(rows["time"]).all() and np.isfinite(rows["value"]).all() and (rows["sigma"] > 0.0).all()
-            ):
-                raise HilError("aiding row: a value is no number, or a sigma is not positive: mend what sends it")
+            _check(rows)
             self._aligner.aid(rows)
-        elif self._aided is not None and self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
+        elif self.mode not in (Mode.NAVIGATE, Mode.DEGRADED):
+            return
+        elif self._aided is None:
+            words = rows[rows["source"] == OPERATOR]
+            _check(words)
+            for word in words:
+                self._set(word)
+        else:
             self._aided.aid(rows)
             for restart in self._aided.restarts():
                 text = "the filter had diverged: it starts again where GNSS says"
                 self.tell(restart.time, "warning", text, station=True)
+
+    def _set(self, word: Any) -> None:
+        """Move or turn the solution to what an operator says."""
+        core, given = self._core, word["value"]
+        if word["kind"] == Kind.GNSS:
+            lat, lon, height = core.solution[:3]
+            meridian, prime = curvature_radii(math.sin(lat))
+            north = (lat - given[0]) * (meridian + height)
+            east = math.remainder(lon - given[1], 2.0 * math.pi) * (prime + height) * math.cos(lat)
+            core.correct(np.array([north, east, 0.0]), np.zeros(3), np.zeros(3))
+            what = "position"
+        elif word["kind"] == Kind.HEADING:
+            turn = math.remainder(euler_from_quaternion(core.solution[6:10])[0] - given[0], 2.0 * math.pi)
+            core.correct(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, turn]))
+            what = "heading"
+        else:
+            return
+        self._state[:] = core.solution
+        self.tell(float(word["time"]), "notice", f"the {what} is the operator's", station=True)
 
     def silent(self) -> StateArray:
         """The sensor has fallen silent: one row that repeats the last state and says so."""
@@ -437,6 +464,11 @@ def _same_flags(validity: IntArray, start: int, stop: int) -> int:
         if (validity[k] ^ validity[start]) & _FLAGS:
             return k
     return stop
+
+
+def _check(rows: NDArray[Any]) -> None:
+    if not (np.isfinite(rows["time"]).all() and np.isfinite(rows["value"]).all() and (rows["sigma"] > 0.0).all()):
+        raise HilError("aiding row: a value is no number, or a sigma is not positive: mend what sends it")
 
 
 def _plan(settings: Settings) -> Plan:

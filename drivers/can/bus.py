@@ -2,7 +2,7 @@
 
 ``unix:NAME`` (:mod:`drivers.can.unix_bus`), ``socketcan:vcan0`` (:mod:`drivers.can.socketcan`) and
 ``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own (``socketcan:can0?filter=120:7F0`` has the kernel keep
-other frames back); anything else is python-can: ``virtual:NAME``,
+other frames back), as is ``mavlink:LINK`` (:mod:`drivers.mavlink.port`); anything else is python-can: ``virtual:NAME``,
 ``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
 """
 
@@ -71,6 +71,10 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
         from drivers.serial.port import SerialPort
 
         return SerialPort(url)
+    if interface == "mavlink":
+        from drivers.mavlink.port import MavlinkPort
+
+        return MavlinkPort(rest)
     words = dict(parse_qsl(query, keep_blank_values=True))
     if interface == "socketcan" and words.keys() <= {"filter"}:
         filters = parse_filters(words["filter"]) if words else ()
