@@ -29,6 +29,8 @@ from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
 from hil.control import Control
+from hil.feed.quantisation import warnings
+from hil.feed.tap import Gate
 from hil.magnetometer import correct
 from hil.reference import Reference, Trace
 from hil.ring import Ring
@@ -97,6 +99,8 @@ class Outlets:
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
     recording: bool = False
+    gate: Gate | None = None
+    """In simulated time with feeds: no solution is overwritten before they have it."""
 
     @staticmethod
     def make(*, recording: bool, readers: int) -> "Outlets":
@@ -150,6 +154,9 @@ class Loop:
         self._align_requests = outlets.control.align_requests
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
+        for feed in scenario.feed:
+            for text in warnings(feed, scenario):
+                self.navigator.tell(0.0, "warning", text)
 
     def take(self, batch: FrameArray) -> bool:
         """Decode and navigate a batch of frames; True when it held a sample."""
@@ -409,6 +416,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     stats, control = outlets.stats, outlets.control
     relayed, relayed_number = frames(BATCH), 0
     while not (control.stop or loop.finished or source.exhausted):
+        if outlets.gate is not None:
+            outlets.gate.wait(outlets.states, outlets.states.capacity // 2, lambda: control.stop)
         n = source.receive(batch, wait)
         now = time.monotonic_ns()
         stats["beat_ns"] = now
@@ -434,6 +443,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
         if event:
             _record(event_record(event, time.time_ns()), outlets, order.paced)
             loop.obey(event)
+    if outlets.gate is not None:
+        outlets.gate.wait(outlets.states, 0, lambda: control.stop)
 
 
 def take_with_events(loop: Loop, taken: FrameArray) -> bool:

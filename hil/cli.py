@@ -37,6 +37,10 @@ Links = Annotated[
     list[str] | None,
     typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
+Feeds = Annotated[
+    list[str] | None,
+    typer.Option("--feed", help="Autopilot: ardupilot-json:HOST:PORT, px4:HOST:PORT, vectornav:pty or :tcp:HOST:PORT."),
+]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
 Asserts = Annotated[
     list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
@@ -51,6 +55,7 @@ def run(
     bus: Bus = None,
     imu: Annotated[str | None, typer.Option(help="Driver of the board on the bus; then no head is simulated.")] = None,
     mavlink: Links = None,
+    feed: Feeds = None,
     duration: Duration = None,
     speed: Speed = "1",
     seed: Seed = None,
@@ -70,7 +75,7 @@ def run(
     del no_dashboard  # accepted, so that command lines stay valid
 
     chosen = load(scenario).with_changes(
-        **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
+        **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink, feed=feed)
     )
     outside = bool(chosen.bus) or imu is not None
     if outside and not _paced(speed):
@@ -118,6 +123,7 @@ def replay(
     scenario: Annotated[str | None, typer.Option(help="Scenario instead of the one in the recording.")] = None,
     bus: Bus = None,
     mavlink: Links = None,
+    feed: Feeds = None,
     speed: Speed = "1",
     record: Record = None,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
@@ -138,7 +144,9 @@ def replay(
     from hil.player import plan_replay, run_player
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
-    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold)))
+    order = replace(
+        order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink, feed=feed or [], withhold=withhold))
+    )
     if plot is not None:
         if order.reference is None:
             raise HilError(f"--plot: {log} carries no attitude to compare with")
@@ -484,6 +492,8 @@ def _run(
         while not (session.ready or stop.wanted):
             view.show_compiling()
             time.sleep(0.1)
+        for place in session.feed_places():
+            _say(f"an autopilot finds its feed at {place}")
         try:
             _follow(session, stop, view)
         except HilError as error:
@@ -537,8 +547,17 @@ def _paced(speed: str) -> bool:
     return speed == "1"
 
 
-def _changes(mavlink: list[str] | None = None, withhold: list[str] | None = None, **options: Any) -> dict[str, Any]:
+def _changes(
+    mavlink: list[str] | None = None,
+    withhold: list[str] | None = None,
+    feed: list[str] | None = None,
+    **options: Any,
+) -> dict[str, Any]:
     changes = {key: value for key, value in options.items() if value is not None}
+    if feed is not None:
+        from hil.feed.config import parse_feed
+
+        changes["feed"] = [parse_feed(text) for text in feed]
     if withhold:
         changes["navigation"] = {"filter": {"withheld": [_outage(text) for text in withhold]}}
     if mavlink:

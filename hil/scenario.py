@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hil.feed.config import FeedConfig
 from nav.errors import HilError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -383,6 +384,8 @@ class Scenario(_Model):
     aiding: AidingConfig = AidingConfig()
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
+    feed: tuple[FeedConfig, ...] = ()
+    """Autopilots that are given the solution (:mod:`hil.feed`)."""
 
     @model_validator(mode="after")
     def _carried(self) -> "Scenario":

@@ -1,6 +1,6 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
-    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, this process
+    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, feeds, this process
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
 """
@@ -9,7 +9,7 @@ import contextlib
 import multiprocessing as mp
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.control import run_part
+from hil.feed.group import FeedGroup
 from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -32,7 +33,8 @@ from nav.state import NAV_STATE, Mode
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
 PUBLISHER_NICE = 10
-"""How far the publisher steps back behind the loop where processors are few."""
+"""How far publisher and feeds step back behind the loop where processors are few."""
+_ASIDE = ("publisher", "feed")
 RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
@@ -84,7 +86,9 @@ class Session:
         publish: bool = True,
     ) -> None:
         self.order = order
-        self.outlets = Outlets.make(recording=record is not None, readers=1)
+        self.feeds = FeedGroup(order.scenario, paced=order.paced)
+        outlets = Outlets.make(recording=record is not None, readers=1 + len(self.feeds.names))
+        self.outlets = replace(outlets, gate=self.feeds.gate)
         self._feeder = feeder
         self._record = record
         self._publish = publish
@@ -122,7 +126,7 @@ class Session:
             ours, theirs = context.Pipe()
             process = context.Process(
                 target=run_part,
-                args=(outlets.control, PUBLISHER_NICE if name == "publisher" else 0, target, *args, theirs),
+                args=(outlets.control, PUBLISHER_NICE if name.startswith(_ASIDE) else 0, target, *args, theirs),
                 name=f"hil-{name}",
                 daemon=True,
             )
@@ -142,6 +146,7 @@ class Session:
             network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
+        self.feeds.launch(launch, outlets.states, 1)
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -161,6 +166,8 @@ class Session:
         self._watch()
         recorder = self._parts.get("recorder")
         if self.outlets.stats["phase"] == Phase.STARTING or (recorder and "ready" not in recorder.answers):
+            return False
+        if len(self.feed_places()) < len(self.feeds.names):
             return False
         if not self.outlets.control.go:
             self._began = time.monotonic()
@@ -231,6 +238,13 @@ class Session:
             for row in rows[:copied]
         ]
 
+    def feed_places(self) -> list[str]:
+        """Where the autopilots find the feeds that listen."""
+        return [feed["place"] for feed in self._feed_summaries() if "place" in feed]
+
+    def _feed_summaries(self) -> list[_Answers]:
+        return self.feeds.summary({name: part.answers for name, part in self._parts.items()})
+
     def stop(self) -> None:
         """Tell the loop to end."""
         self.outlets.control.order_stop()
@@ -248,18 +262,22 @@ class Session:
                 raise HilError(str(failed))
             if failed not in self.problems:
                 self.problems.append(str(failed))
+                if part.name in self.feeds.names:
+                    self.feeds.gone(part.name)
 
     def _end(self) -> None:
         self._ended = time.monotonic()
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher"):
+        for name in ("loop", "feeder", "recorder", "publisher", *self.feeds.names):
             part = self._parts.get(name)
             if part is None:
                 continue
             if name == "publisher":
                 self._publisher_stop.call()
+            elif name in self.feeds.names:
+                self.feeds.stop(name)
             patience = RECORDER_STOP_S if name == "recorder" else 0.0
             while part.process.is_alive() and time.monotonic() < deadline + patience:
                 part.read()
@@ -294,6 +312,8 @@ class Session:
                     result.update(answers)
                 else:
                     result[name] = answers
+        if feeds := self._feed_summaries():
+            result["feeds"] = feeds
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
         if self.problems:
             result["problems"] = self.problems

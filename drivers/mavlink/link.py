@@ -170,6 +170,10 @@ class StreamLink:
         lazy: bool = False,
     ) -> None:
         self.url = url
+        self.connections = 0
+        """Connections so far."""
+        self.refused = 0
+        """Clients that were turned away."""
         self._opener = opener
         self._listener = listener
         self._channel: Channel | None = None
@@ -264,9 +268,11 @@ class StreamLink:
                 _tune(client)
                 self._take(client)
             else:
+                self.refused += 1
                 client.close()
 
     def _take(self, channel: Channel) -> None:
+        self.connections += 1
         self._channel, self._tail = channel, b""
         self._epoll.register(channel.fileno(), select.EPOLLIN)
 
