@@ -33,8 +33,7 @@ from nav.state import NAV_STATE, Mode
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
 PUBLISHER_NICE = 10
-"""How far publisher and feeds step back behind the loop where processors are few."""
-_ASIDE = ("publisher", "feed")
+"""How far the publisher steps back behind the loop where processors are few."""
 RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
@@ -126,7 +125,7 @@ class Session:
             ours, theirs = context.Pipe()
             process = context.Process(
                 target=run_part,
-                args=(outlets.control, PUBLISHER_NICE if name.startswith(_ASIDE) else 0, target, *args, theirs),
+                args=(outlets.control, PUBLISHER_NICE if name == "publisher" else 0, target, *args, theirs),
                 name=f"hil-{name}",
                 daemon=True,
             )

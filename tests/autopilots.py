@@ -109,9 +109,7 @@ class Px4:
         self.heard: list[Any] = []
         self.send(mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GENERIC, mav.MAV_AUTOPILOT_PX4, 0, 0, 0, 3))
         interval = (mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, 5e3)
-        self.send(
-            mav.MAVLink_command_long_message(0, 0, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *interval, 0, 0, 0, 0, 0)
-        )
+        self.send(mav.MAVLink_command_long_message(0, 0, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *interval, 0, 0, 0, 0, 0))
 
     def send(self, message: Any) -> None:
         self.socket.sendall(message.pack(self.mav))

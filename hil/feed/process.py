@@ -9,14 +9,19 @@ from contextlib import ExitStack
 from multiprocessing.connection import Connection
 from typing import Any
 
+import numpy as np
+
+from drivers.mavlink.px4 import hil_state_quaternion
 from hil.feed.ardupilot import JsonFeed
-from hil.feed.common import Feed, Socket
+from hil.feed.common import ACTUATORS, Commanded, Feed, Maker, Socket
 from hil.feed.config import FeedConfig
 from hil.feed.px4 import Px4Feed
+from hil.feed.tap import Tap
 from hil.feed.vectornav import VectorNavFeed
-from hil.ring import Wake
+from hil.ring import Ring, Wake
 from hil.scenario import Scenario
 from nav.errors import HilError
+from nav.state import NAV_STATE, Mode
 
 _MAKERS: dict[str, Callable[[FeedConfig, Scenario, Socket], Feed]] = {
     "ardupilot-json": JsonFeed,
@@ -33,6 +38,7 @@ def run_feed(config: FeedConfig, scenario: Scenario, joint: Socket, stop: Wake, 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
         try:
+            _warm_up(config, scenario)
             feed = _MAKERS[config.kind](config, scenario, joint)
             stack.callback(feed.close)
             _tell(report, {"place": feed.place})
@@ -72,6 +78,19 @@ def _serve(feed: Feed, joint: Socket, stop: Wake, report: Connection, patience_s
             began_s = began_s or now_s
             if now_s - max(began_s, feed.heard_s) > patience_s and not feed.hungry:
                 raise HilError(f"no autopilot on {feed.place} for {patience_s:g} s: simulated time goes on without it")
+
+
+def _warm_up(config: FeedConfig, scenario: Scenario) -> None:
+    """Compile or load every kernel before the autopilot is asked to come."""
+    ring, row = Ring(NAV_STATE, 4, 0), np.zeros(1, NAV_STATE)
+    row["mode"], row["q_nb"] = Mode.NAVIGATE, (1.0, 0.0, 0.0, 0.0)
+    ring.push(row)
+    rows, make = Tap(ring).take(0.0), Maker(config, scenario)
+    solution = None if rows is None else make.solution(rows)
+    if solution is not None:
+        make.around(solution)
+        hil_state_quaternion(solution)
+    Commanded(Ring(ACTUATORS, 4, 0)).tell(0.0, (0.0,))
 
 
 def _tell(report: Connection, what: dict[str, Any]) -> None:

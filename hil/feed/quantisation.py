@@ -3,14 +3,10 @@
 import math
 from dataclasses import dataclass
 
-from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from hil.feed.config import FeedConfig
 from hil.scenario import Scenario
 from nav.earth import STANDARD_GRAVITY
 from nav.instruments.grades import GRADES
-
-_SINGLE = 2.0**-23
-"""Step of single precision from 1 to 2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,12 +17,14 @@ class Resolution:
     force: float
 
 
+_SINGLE = Resolution(2.0**-23, 2.0**-20)
+"""Single precision, to 2 rad/s and 16 m/s^2."""
 STEPS = {
     "px4": Resolution(math.radians(2000.0 / 32768.0), STANDARD_GRAVITY / 2048.0),
-    "ardupilot-json": Resolution(_SINGLE, 8.0 * _SINGLE),
-    "vectornav": Resolution(_SINGLE, 8.0 * _SINGLE),
+    "ardupilot-json": _SINGLE,
+    "vectornav": _SINGLE,
 }
-"""PX4 takes id 0 for a sensor of 16 bits, 2000 deg/s and 16 g; the others keep single precision (to 2 rad/s and 16 m/s^2)."""
+"""PX4 takes id 0 for a sensor of 16 bits, 2000 deg/s and 16 g."""
 _IMU_HZ = {"vectornav": 50.0}
 """How many a second the autopilot asks for."""
 
@@ -34,23 +32,16 @@ _IMU_HZ = {"vectornav": 50.0}
 def noise_of(scenario: Scenario, rate_hz: float) -> Resolution | None:
     """Noise of means over ``1 / rate_hz`` by the grade of the scenario; None for a board of no known grade.
 
-    A head without errors is as noisy as its wire rounds.
+    A head without errors has none.
     """
-    head, chosen = scenario.head, scenario.navigation.filter
-    name = chosen.grade or head.grade
-    if name == "none" and scenario.driver != "dtg-head":
-        return None
-    samples = max(head.rate_hz / rate_hz, 1.0)
-    rate = ANGLE_LSB * head.rate_hz / samples
-    force = VELOCITY_LSB[head.layout] * head.rate_hz / samples
-    if name != "none":
-        grade = GRADES[name]
-        given, forced = chosen.gyro_deg_sqrt_h, chosen.accelerometer_ms_sqrt_h
-        rate_white = grade.gyro_white if given is None else math.radians(given) / 60.0
-        force_white = grade.accelerometer_white if forced is None else forced / 60.0
-        rate = math.hypot(rate, rate_white * math.sqrt(rate_hz))
-        force = math.hypot(force, force_white * math.sqrt(rate_hz))
-    return Resolution(rate, force)
+    name = scenario.navigation.filter.grade or scenario.head.grade
+    if name == "none":
+        return Resolution(0.0, 0.0) if scenario.driver == "dtg-head" else None
+    grade, chosen = GRADES[name], scenario.navigation.filter
+    given, forced = chosen.gyro_deg_sqrt_h, chosen.accelerometer_ms_sqrt_h
+    rate = grade.gyro_white if given is None else math.radians(given) / 60.0
+    force = grade.accelerometer_white if forced is None else forced / 60.0
+    return Resolution(rate * math.sqrt(rate_hz), force * math.sqrt(rate_hz))
 
 
 def delivered_hz(feed: FeedConfig, scenario: Scenario) -> float:
@@ -64,8 +55,9 @@ def warnings(feed: FeedConfig, scenario: Scenario) -> list[str]:
     noise = noise_of(scenario, delivered_hz(feed, scenario))
     if noise is None:
         return []
-    step = STEPS[feed.kind]
-    found = []
+    step, found = STEPS[feed.kind], []
+    if noise.rate == 0.0 and step is _SINGLE:  # its steps shrink with the value: nothing to warn of
+        return []
     for what, coarse, fine, unit, scale in (
         ("rates", step.rate, noise.rate, "deg/s", math.degrees(1.0)),
         ("forces", step.force, noise.force, "mg", 1e3 / STANDARD_GRAVITY),
@@ -73,6 +65,6 @@ def warnings(feed: FeedConfig, scenario: Scenario) -> list[str]:
         if coarse > fine:
             found.append(
                 f"feed {feed.kind}: the autopilot rounds {what} to {coarse * scale:.3g} {unit}, "
-                f"{coarse / fine:.3g} times the noise of the sensor ({fine * scale:.2g} {unit})"
+                f"more coarsely than the noise of the sensor ({fine * scale:.2g} {unit})"
             )
     return found

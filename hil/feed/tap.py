@@ -1,5 +1,6 @@
 """What a feed takes of the ring of solutions, and the gate that makes simulated time wait for the autopilots."""
 
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -8,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hil.ring import Ring, Shared
+from nav.increments import FloatArray, IntArray
+from nav.kernel import kernel
 from nav.state import NAV_STATE, Mode
 
 Rows = NDArray[Any]
+_NAVIGATE = int(Mode.NAVIGATE)
 _OPEN = 1 << 62
 _POLL_S = 0.0005
 _SPAN_ROWS = 1024
@@ -67,7 +71,8 @@ class Tap:
         self._ring, self._gate, self._feed = ring, gate, feed
         self._rows = np.zeros(ring.capacity if gate is None else _SPAN_ROWS, NAV_STATE)
         self._number = 0
-        self._last: float | None = None
+        self._index, self._times = np.zeros(len(self._rows), np.int64), np.zeros(len(self._rows))
+        self._last = -math.inf
         self._step = 1e-3
         self._shift = 0.0
         self.lost = 0
@@ -96,21 +101,22 @@ class Tap:
         copied, first = self._ring.pull(self._rows[:most], self._number)
         self.lost += first - self._number
         self._number = first
-        index, times, broken = self._continued(self._rows[:copied])
-        if len(index) == 0:
+        rows, index, times = self._rows[:copied], self._index, self._times
+        there, self._shift, broken = _go_on(
+            rows["time"], rows["mode"], self._last, self._step, self._shift, index, times
+        )
+        if there == 0:
             self._pass(copied)
             return None
-        end = span_s - _EARLY + (times[0] - self._step if self._last is None else self._last)
-        count = int(np.searchsorted(times, end)) + 1
-        if count > len(index) and not broken and copied < len(self._rows):
+        begin = self._last if self._last > -math.inf else times[0] - self._step
+        count = int(times[:there].searchsorted(begin + span_s - _EARLY)) + 1
+        if count > there and not broken and copied < len(self._rows):
             return None
-        if self._gate is None or count > len(index):
-            count = len(index)
-        taken: Rows = self._rows[index[:count]]
+        if self._gate is None or count > there:
+            count = there
+        taken: Rows = rows[index[:count]]
         taken["time"] = times[:count]
-        before = times[count - 2] if count > 1 else self._last
-        if before is not None:
-            self._step = float(times[count - 1] - before)
+        self._step = float(times[count - 1]) - (float(times[count - 2]) if count > 1 else float(begin))
         self._last = float(times[count - 1])
         self._pass(int(index[count - 1]) + 1)
         return taken
@@ -120,22 +126,36 @@ class Tap:
         if self._gate is not None:
             self._gate.set(self._feed, self._number)
 
-    def _continued(self, rows: Rows) -> tuple[NDArray[np.intp], NDArray[np.float64], bool]:
-        """Which of `rows` are navigated and new, their times as they go on, and whether there the clock begins anew."""
-        index = np.flatnonzero(rows["mode"] >= Mode.NAVIGATE)
-        if len(index) == 0:
-            return index, np.zeros(0), False
-        times = rows["time"][index] + self._shift
-        last = -np.inf if self._last is None else self._last
-        if times[0] < last:
-            again = last + self._step - times[0]
-            self._shift += again
-            times += again
-        back = np.flatnonzero(np.diff(times) < 0.0)
-        if len(back):
-            index, times = index[: back[0] + 1], times[: back[0] + 1]
-        new = np.diff(times, prepend=last) > 0.0  # a silent sensor's solution is told twice
-        return index[new], times[new], len(back) > 0
+
+@kernel
+def _go_on(
+    times: FloatArray,
+    modes: NDArray[np.int32],
+    last: float,
+    step: float,
+    shift: float,
+    index: IntArray,
+    out: FloatArray,
+) -> tuple[int, float, bool]:
+    """Fill `index` with the places of rows that are navigated and new, `out` with their times as they go on behind `last`.
+
+    How many, the new shift, and whether the clock begins anew behind them. A silent sensor's solution is told twice: it is not new.
+    """
+    n, newest = 0, last
+    for i in range(times.shape[0]):
+        if modes[i] < _NAVIGATE:
+            continue
+        time = times[i] + shift
+        if time < newest:
+            if n > 0:
+                return n, shift, True
+            shift += newest + step - time
+            time = newest + step
+        if time > newest:
+            index[n], out[n] = i, time
+            newest = time
+            n += 1
+    return n, shift, False
 
 
 def mean_row(rows: Rows, rates: str) -> Any:
