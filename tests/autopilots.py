@@ -48,8 +48,9 @@ class Sensed:
 class Sitl:
     """ArduPilot SITL: ``sim_vehicle.py -f JSON:127.0.0.1``."""
 
-    def __init__(self, port: int, channels: int = 16, rate_hz: int = 1200) -> None:
+    def __init__(self, port: int, channels: int = 16, rate_hz: int = 1200, own_port: int = 0) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", own_port))
         self.socket.connect(("127.0.0.1", port))
         self.socket.settimeout(5.0)
         self.magic = {16: 18458, 32: 29569}[channels]

@@ -264,12 +264,20 @@ class StreamLink:
                 client, _ = listener.accept()
             except OSError:
                 return
+            if self._channel is not None and self._left(self._channel):
+                self._drop()
             if self._channel is None:
                 _tune(client)
                 self._take(client)
             else:
                 self.refused += 1
                 client.close()
+
+    def _left(self, channel: Channel) -> bool:
+        """Whether the other end has closed, though what it sent before is not all read."""
+        poll = select.poll()
+        poll.register(channel.fileno(), select.POLLRDHUP)
+        return bool(poll.poll(0))
 
     def _take(self, channel: Channel) -> None:
         self.connections += 1

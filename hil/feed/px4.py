@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +21,8 @@ SLOW_SENSORS_HZ = 50.0
 """Magnetometer and barometer."""
 LOCKSTEP_S = 0.2
 """Longest wait for the actuators."""
+_REMEMBERED = 64
+"""Newest times of HIL_SENSOR: actuators of an older one do not stand for those of the newest."""
 _BEAT_S = 1.0
 _PIECES = 16
 """Pieces of input that are taken before something is sent."""
@@ -57,6 +59,7 @@ class Px4Feed:
         self._mav = mav.MAVLink(None, _SYSTEM, _COMPONENT)
         self._mav.robust_parsing = True
         self._lockstep = self._awaiting = False
+        self._sent_us: deque[int] = deque(maxlen=_REMEMBERED)
         self._sent_s = self._beat_s = -1e9
         self._slow_due = self._gps_due = self._state_due = 0.0
         self._state_s: float | None = 0.0
@@ -121,7 +124,8 @@ class Px4Feed:
                 self.bad_data += 1
                 return
             self._commanded.tell(self._time_s, controls.values, armed=controls.armed)
-            self._lockstep, self._awaiting = controls.lockstep, False
+            late = message.time_usec in self._sent_us and message.time_usec != self._sent_us[-1]
+            self._lockstep, self._awaiting = controls.lockstep, controls.lockstep and self._awaiting and late
         elif kind == "COMMAND_LONG":
             wanted = message.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL and math.isfinite(message.param2)
             known = wanted and message.param1 == mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION
@@ -147,7 +151,9 @@ class Px4Feed:
             fields |= px4.MAGNETOMETER | px4.BAROMETER
         if self.sent["HIL_SENSOR"] % round(1.0 / self._period) == 0:
             self._send(px4.system_time(solution))
-        self._send(px4.hil_sensor(solution, around, fields))
+        sensor = px4.hil_sensor(solution, around, fields)
+        self._sent_us.append(sensor.time_usec)
+        self._send(sensor)
         self._ended = time.monotonic()
         self._began = self._began or self._ended
 
