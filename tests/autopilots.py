@@ -194,7 +194,7 @@ class ArduPilotAhrs:
                     told = 0
                     for byte in line[0]:
                         told ^= byte
-                    if told == int(line[1], 16) and terms[0] == text[:5] and terms[1] == text[6:].split(",")[0]:
+                    if told == int(line[1], 16) and terms[0] == text[:5] and terms[1] == text[6:].partition(",")[0]:
                         return terms
         raise AssertionError(f"no answer to ${text}")
 

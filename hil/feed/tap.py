@@ -139,7 +139,7 @@ def _go_on(
 ) -> tuple[int, float, bool]:
     """Fill `index` with the places of rows that are navigated and new, `out` with their times as they go on behind `last`.
 
-    How many, the new shift, and whether the clock begins anew behind them. A silent sensor's solution is told twice: it is not new.
+    How many, the new shift, and whether the clock begins anew behind them. What a silent sensor's loop tells again is not new.
     """
     n, newest = 0, last
     for i in range(times.shape[0]):

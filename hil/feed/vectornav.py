@@ -1,6 +1,7 @@
 """The feed to ArduPilot's ExternalAHRS: a VectorNav VN-300 on a pseudo-terminal, a TCP port or a serial line."""
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 
 from drivers.mavlink.link import Link, open_link
 from drivers.mavlink.px4 import Claim
-from drivers.mavlink.solution import Vector
+from drivers.mavlink.solution import Solution
 from drivers.serial.pty import PtyLink
 from drivers.serial.vectornav_ahrs import OUTPUTS, Ahrs, Measured, Output
 from hil.feed.common import Maker, Socket
@@ -19,8 +20,8 @@ from nav.errors import HilError
 
 _PIECES = 16
 """Pieces of input that are taken before something is sent."""
-_ROOM = 8192
-"""Most solutions of one packet: what comes beyond is left out of its mean."""
+_LATE_S = 0.1
+"""Packets that are later than this become one."""
 
 
 class _Stream:
@@ -31,18 +32,18 @@ class _Stream:
         self._rows: list[Rows] = []
         self._due: float | None = None
 
-    def add(self, rows: Rows) -> Rows | None:
-        """The solutions of a packet that is due with the newest of `rows`; None where none is."""
-        now, period = float(rows["time"][-1]), self.output.period_s
-        self._rows.append(rows)
-        if self._due is None:
-            self._due = now + period
-        if now < self._due - 1e-6:
-            return None
-        self._due = self._due + period if now < self._due + period else now + period
-        taken: Rows = np.concatenate(self._rows)[-_ROOM:]
-        self._rows.clear()
-        return taken
+    def add(self, rows: Rows) -> Iterator[Rows]:
+        """The solutions of each packet that is due with `rows`."""
+        times, period, start = rows["time"], self.output.period_s, 0
+        due = times[0] + period if self._due is None else self._due
+        due = max(due, times[-1] - _LATE_S)
+        while (at := int(times.searchsorted(due - 1e-6))) < len(rows):
+            self._rows.append(rows[start : at + 1])
+            yield np.concatenate(self._rows)
+            self._rows.clear()
+            start, due = at + 1, due + period
+        self._rows.append(rows[start:])
+        self._due = due
 
 
 class VectorNavFeed:
@@ -92,15 +93,15 @@ class VectorNavFeed:
 
     def _feed(self, rows: Rows) -> None:
         for number, stream in zip(OUTPUTS, self._streams, strict=False):
-            taken = stream.add(rows)
-            solution = None if taken is None else self._make.solution(taken)
-            if taken is None or solution is None:
-                continue
-            bias = taken["gyro_bias"][-1]
-            raw = np.asarray(solution.w_ib_b) + (0.0 if self._compensated else bias)
-            three: Vector = float(raw[0]), float(raw[1]), float(raw[2])
-            measured = Measured(solution, three, self._make.around(solution), self._claim)
-            self._send(f"output {number}", stream.output.packet(measured))
+            for taken in stream.add(rows):
+                solution = self._make.solution(taken)
+                if solution is not None:
+                    self._send(f"output {number}", stream.output.packet(self._measured(solution, taken)))
+
+    def _measured(self, solution: Solution, taken: Rows) -> Measured:
+        bias = 0.0 if self._compensated else taken["gyro_bias"][-1]
+        x, y, z = (np.asarray(solution.w_ib_b) + bias).tolist()
+        return Measured(solution, (x, y, z), self._make.around(solution), self._claim)
 
     def _send(self, name: str, data: bytes) -> None:
         if self._link.send(data):

@@ -230,6 +230,8 @@ def test_actuators_that_are_no_numbers_are_refused(lockstep: RunningFeed) -> Non
 
 
 def test_an_address_in_use_is_told() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        with running_feed(kind="px4", address=f"127.0.0.1:{taken.getsockname()[1]}") as feed:
-            assert "cannot open it: Address already in use" in feed.said["failed"]
+    with (
+        socket.create_server(("127.0.0.1", 0)) as taken,
+        running_feed(kind="px4", address=f"127.0.0.1:{taken.getsockname()[1]}") as feed,
+    ):
+        assert "cannot open it: Address already in use" in feed.said["failed"]
