@@ -27,15 +27,16 @@ _PX4_SAMPLES = 4
 
 def rows(sizes: Sizes) -> list[Row]:
     """A row for each feed that has a lockstep."""
+    frames = max(sizes.calls // 4, 1)
     with _fed("ardupilot-json") as (port, push), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sitl:
         sitl.connect(("127.0.0.1", port))
         sitl.settimeout(_END_S)
         what = "a frame of ArduPilot's JSON lockstep, over UDP"
-        json = rows_in_turns([Work("feed-json", what, _Sitl(sitl, push, sizes.calls), sizes.calls)], sizes.repeats)
+        json = rows_in_turns([Work("feed-json", what, _Sitl(sitl, push, frames), frames)], sizes.repeats)
     with _fed("px4") as (port, push), socket.create_connection(("127.0.0.1", port), _END_S) as px4:
         px4.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         what = "a HIL_SENSOR of PX4's lockstep, over TCP"
-        return json + rows_in_turns([Work("feed-px4", what, _Px4(px4, push, sizes.calls), sizes.calls)], sizes.repeats)
+        return json + rows_in_turns([Work("feed-px4", what, _Px4(px4, push, frames), frames)], sizes.repeats)
 
 
 class _Sitl:
@@ -101,6 +102,7 @@ def _fed(kind: str) -> Iterator[tuple[int, Callable[[int], None]]]:
 
 
 def _push(states: Ring, row: np.ndarray[tuple[int], np.dtype[np.void]], count: int) -> None:
-    for _ in range(count):
-        row["time"] += 1e-3
-        states.push(row)
+    rows = np.repeat(row, count)
+    rows["time"] += 1e-3 * np.arange(1, count + 1)
+    row["time"] = rows["time"][-1]
+    states.push(rows)

@@ -138,32 +138,35 @@ class Px4Feed:
         """HIL_SENSOR comes last: what goes before belongs to the moment to which it sets PX4's clock."""
         now, fields = solution.time, px4.ACCELEROMETER | px4.GYRO
         self._time_s = now
-        around = None
+        around, messages = None, []
         if self._derived and now >= self._gps_due:
             self._gps_due = _next(self._gps_due, self._gps_s, now)
-            self._send(px4.hil_gps(solution, self._claim))
+            messages.append(px4.hil_gps(solution, self._claim))
         if self._state_s is not None and now >= self._state_due:
             self._state_due = _next(self._state_due, self._state_s, now)
-            self._send(px4.hil_state_quaternion(solution))
+            messages.append(px4.hil_state_quaternion(solution))
         if self._derived and now >= self._slow_due:
             self._slow_due = _next(self._slow_due, 1.0 / SLOW_SENSORS_HZ, now)
             around = self._make.around(solution)
             fields |= px4.MAGNETOMETER | px4.BAROMETER
         if self.sent["HIL_SENSOR"] % round(1.0 / self._period) == 0:
-            self._send(px4.system_time(solution))
+            messages.append(px4.system_time(solution))
         sensor = px4.hil_sensor(solution, around, fields)
         self._sent_us.append(sensor.time_usec)
-        self._send(sensor)
+        self._send(*messages, sensor)
         self._ended = time.monotonic()
         self._began = self._began or self._ended
 
-    def _send(self, message: Any) -> None:
-        frame = bytes(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
-        if self._link.send(frame):
-            self.sent[message.get_type()] += 1
+    def _send(self, *messages: Any) -> None:
+        """Send messages together: PX4 is woken once."""
+        data = b""
+        for message in messages:
+            data += message.pack(self._mav)
+            self._mav.seq = (self._mav.seq + 1) % 256
+        if self._link.send(data):
+            self.sent.update(message.get_type() for message in messages)
         else:
-            self.dropped += 1
+            self.dropped += len(messages)
 
     def counters(self) -> dict[str, Any]:
         """See `Feed.counters`."""
