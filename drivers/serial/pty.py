@@ -27,6 +27,7 @@ class PtyLink:
     """
 
     datagrams = False
+    gone = False
 
     def __init__(self, path: Path | None = None) -> None:
         self._ours, self._theirs = os.openpty()
@@ -35,7 +36,6 @@ class PtyLink:
         device = os.ttyname(self._theirs)
         self._path = path
         self.url = device if path is None else str(path)
-        self.connections, self.refused = 0, 0
         if path is None:
             return
         try:
@@ -61,6 +61,9 @@ class PtyLink:
             return os.read(self._ours, _CHUNK)
         except BlockingIOError:
             return b""
+
+    def heard(self) -> None:
+        """There is but one peer: nothing to do."""
 
     def send(self, frame: bytes) -> bool:
         """Send a whole frame or nothing; False when it was dropped."""

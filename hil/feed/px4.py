@@ -9,7 +9,8 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink import px4
-from drivers.mavlink.link import StreamLink, open_link
+from drivers.mavlink.link import Listener, open_link
+from drivers.mavlink.sole import SoleClient
 from drivers.mavlink.solution import Solution
 from hil.feed.common import Commanded, Maker, Socket
 from hil.feed.config import FeedConfig
@@ -34,12 +35,12 @@ class Px4Feed:
 
     def __init__(self, config: FeedConfig, scenario: Scenario, joint: Socket) -> None:
         try:
-            link = open_link(f"tcpin:{config.place}")
+            listener = open_link(f"tcpin:{config.place}")
         except HilError as error:
             raise HilError(f"feed {config.name}: {error}") from error
-        assert isinstance(link, StreamLink)
-        self._link = link
-        self.place = f"tcp {config.place.rpartition(':')[0]}:{link.port}"
+        assert isinstance(listener, Listener)
+        self._link = SoleClient(listener)
+        self.place = f"tcp {config.place.rpartition(':')[0]}:{listener.port}"
         self._period, self._gps_s = 1.0 / config.rate_hz, 1.0 / config.gps_hz
         self._derived, self._claim = config.derived, px4.Claim(config.claim_m, config.claim_ms)
         self._paced = joint.gate is None

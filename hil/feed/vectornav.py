@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.mavlink.link import Link, open_link
+from drivers.mavlink.link import Link, Listener, open_link
 from drivers.mavlink.px4 import Claim
+from drivers.mavlink.sole import SoleClient
 from drivers.mavlink.solution import Solution
 from drivers.serial.pty import PtyLink
 from drivers.serial.vectornav_ahrs import OUTPUTS, Ahrs, Measured, Output
@@ -133,8 +134,9 @@ def _opened(config: FeedConfig) -> tuple[Link, str]:
         if kind == "pty":
             terminal = PtyLink(Path(rest) if rest else None)
             return terminal, f"pty {terminal.url}"
-        link = open_link(f"tcpin:{rest}" if kind == "tcp" else config.place)
+        opened = open_link(f"tcpin:{rest}" if kind == "tcp" else config.place)
     except HilError as error:
         raise HilError(f"feed {config.name}: {error}") from error
-    port = getattr(link, "port", 0)
-    return link, f"tcp {rest.rpartition(':')[0]}:{port}" if kind == "tcp" else config.place
+    if isinstance(opened, Listener):
+        return SoleClient(opened), f"tcp {rest.rpartition(':')[0]}:{opened.port}"
+    return opened, config.place

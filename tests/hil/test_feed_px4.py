@@ -123,7 +123,7 @@ def test_known_sigmas_are_stated() -> None:
         row["time"] += 0.5
         row["sigma"] = (3.0, 4.0, 2.0, 0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-2)
         feed.ring.push(row)
-        until(lambda: px4.sensors(0.05) or (px4.of("HIL_GPS")[-1].eph == 500))
+        until(lambda: px4.sensors(0.05) is not None and px4.of("HIL_GPS")[-1].eph == 500)
         assert px4.of("HIL_GPS")[-1].epv == 200
 
 
