@@ -436,7 +436,6 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
             stats["phase"] = Phase.READY
             _run(loop, source, order, outlets)
         finally:
-            outlets.control.loop_ends()
             source.close()
         result = loop.result() | {"overflowed": source.overflowed}
         if granted:
@@ -444,9 +443,11 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         if source.problem():
             result["problem"] = source.problem()
         stats["phase"] = Phase.DONE
+        outlets.control.loop_ends()
         answer.send(result)
     except HilError as error:
         stats["phase"] = Phase.FAILED
+        outlets.control.loop_ends()
         answer.send({"failed": str(error)})
     finally:
         answer.close()
