@@ -130,7 +130,7 @@ def test_mavsdk_sees_and_sets(tmp_path: Path) -> None:
     agrees(1e-6 * time_us, *(math.radians(angle) for angle in (roll, pitch, yaw)))
     assert found["position"][0] == pytest.approx(math.degrees(0.87), abs=1e-2)
     assert found["health"]["is_home_position_ok"]
-    assert len(found["parameters"]) == 18
+    assert len(found["parameters"]) == 19
     assert found["set"] == 7.0
     assert found["attitude_hz"] == pytest.approx(20.0, rel=0.25)
     assert found["home"] != 0
@@ -154,7 +154,7 @@ def test_node_mavlink_loses_nothing(node: list[str], key: Path, signed: bool) ->
     time_ms, roll, pitch, yaw = found["attitude"]
     agrees(1e-3 * time_ms, roll, pitch, yaw)
     assert found["parameters"]["SR_HUD_HZ"] == 7.0
-    assert len(found["parameters"]) == 18
+    assert len(found["parameters"]) == 19
     assert (found["acks"]["511"], found["acks"]["512"]) == (0, 0)
     assert found["wrong"] == 0
     assert (found["signed"] > 0.9 * total) == signed
@@ -209,7 +209,7 @@ def test_mavproxy_and_the_log_tools_find_no_loss(tmp_path: Path) -> None:
     assert "link 1 OK" in output
     assert "0.0% loss" in output
     assert " 0 lost" in output
-    assert "Received 18 parameters" in output
+    assert "Received 19 parameters" in output
     printed = tool("mavloss.py", str(log))
     ours = next(line.split() for line in printed.splitlines() if line.split()[:2] == ["1", "1"])
     assert (ours[3], ours[4]) == ("0", "0.0%")
@@ -234,12 +234,12 @@ def test_a_signed_connection_with_mavproxy(tmp_path: Path, key: Path, right: boo
     assert counters["refused"]["unsigned"] > 0  # before it had the key
     if right:
         assert counters["received"]["PARAM_REQUEST_LIST"] > 0
-        assert "Received 18 parameters" in output
+        assert "Received 19 parameters" in output
         assert " 0 lost, 0.0% loss" in output
     else:
         assert counters["received"] == {}
         assert counters["refused"]["wrong signature"] > 0
-        assert "Received 18 parameters" not in output
+        assert "Received 19 parameters" not in output
 
 
 @pytest.fixture
@@ -264,7 +264,7 @@ def test_ten_reconnects(server: tuple[Bridge, int]) -> None:
         while len(names) < 18 and time.monotonic() < deadline:
             message = link.recv_match(type="PARAM_VALUE", blocking=True, timeout=1)
             names |= {message.param_id} if message is not None else set()
-        assert len(names) == 18
+        assert len(names) == 19
         assert link.mav_loss == 0
         link.close()
     counters = bridge.end()
