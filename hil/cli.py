@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -16,6 +16,7 @@ from nav.errors import HilError
 
 if TYPE_CHECKING:
     from hil.bridge import LoopOrder
+    from hil.dashboard import Window
     from hil.session import Session
 
 COMMON_BUS = "unix:dtg-hil"
@@ -42,6 +43,14 @@ Asserts = Annotated[
     list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
 ]
 Junit = Annotated[Path | None, typer.Option(help="Write the assertions as JUnit XML.")]
+Dashboard = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="Where the window is served; 127.0.0.1:8765 or the next free port."),
+]
+NoDashboard = Annotated[bool, typer.Option("--no-dashboard", help="Serve no window.")]
+Tui = Annotated[
+    bool, typer.Option("--tui", help="Show the run in the terminal; no window unless --dashboard is given.")
+]
 ScenarioName = Annotated[str | None, typer.Argument(help="TOML file or built-in name; left out: the embedded default.")]
 
 
@@ -57,17 +66,15 @@ def run(
     record: Record = None,
     assertion: Asserts = None,
     junit: Junit = None,
-    no_dashboard: Annotated[
-        bool, typer.Option("--no-dashboard", help="Serve no dashboard (this version has none).")
-    ] = False,
+    dashboard: Dashboard = None,
+    no_dashboard: NoDashboard = False,
+    tui: Tui = False,
     as_json: Json = False,
 ) -> None:
     """Run the bridge: IMU in, navigation, MAVLink out. Without a bus it brings its own simulated head."""
     from hil.bridge import LoopOrder
     from hil.scenario import load
     from hil.session import simulated_head
-
-    del no_dashboard  # accepted, so that command lines stay valid
 
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
@@ -87,7 +94,8 @@ def run(
         paced=_paced(speed),
         own_world=not outside,
     )
-    _run(order, None if outside else simulated_head(order), record, assertion, junit, as_json=as_json)
+    screen = _Screen(dashboard, no_dashboard, tui)
+    _run(order, None if outside else simulated_head(order), record, assertion, junit, screen=screen, as_json=as_json)
 
 
 @app.command()
@@ -130,6 +138,9 @@ def replay(
     ] = None,
     assertion: Asserts = None,
     junit: Junit = None,
+    dashboard: Dashboard = None,
+    no_dashboard: NoDashboard = False,
+    tui: Tui = False,
     as_json: Json = False,
 ) -> None:
     """Send a recording through the same bridge."""
@@ -155,7 +166,8 @@ def replay(
 
         return {"smoothed": smooth_recording(log, order.scenario, smooth)}
 
-    summary = _run(order, feeder, record, assertion, junit, smoothed, as_json=as_json)
+    screen = _Screen(dashboard, no_dashboard, tui)
+    summary = _run(order, feeder, record, assertion, junit, smoothed, screen=screen, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -460,6 +472,24 @@ def version() -> None:
     print(f"dtg-hil {installed('dtg-hil')}")
 
 
+class _Screen(NamedTuple):
+    """How a run is shown besides its status line."""
+
+    address: str | None
+    off: bool
+    tui: bool
+
+    def open(self, *, paced: bool) -> "Window | None":
+        """The window, where one is wanted: by default, in real time, and not beside the terminal's."""
+        from hil.dashboard import open_window
+
+        if self.off and self.address is not None:
+            raise HilError("--dashboard and --no-dashboard exclude each other")
+        if self.off or (self.address is None and (self.tui or not paced)):
+            return None
+        return open_window(self.address, _say)
+
+
 def _run(
     order: "LoopOrder",
     feeder: Any,
@@ -468,19 +498,23 @@ def _run(
     junit: Path | None,
     more: Callable[[], dict[str, Any]] = dict,
     *,
+    screen: _Screen,
     as_json: bool,
 ) -> dict[str, Any]:
     """Run a session to its end, show it with what `more` adds, check the assertions; the summary."""
     from hil.assertions import parse, write_junit
     from hil.console import RunView, print_summary
     from hil.session import Session
+    from hil.tui import TerminalView, check_terminal
 
     checks = [parse(text) for text in assertions or []]
     if junit is not None and not checks:
         raise HilError("--junit needs at least one --assert")
+    if screen.tui:
+        check_terminal()
     stop = _StopSignal()
-    session = Session(order, feeder=feeder, record=record_to)
-    with session, RunView(session) as view:
+    session = Session(order, feeder=feeder, record=record_to, window=screen.open(paced=order.paced))
+    with session, TerminalView(session, stop.call) if screen.tui else RunView(session) as view:
         while not (session.ready or stop.wanted):
             view.show_compiling()
             time.sleep(0.1)
@@ -524,6 +558,10 @@ class _StopSignal:
         self.wanted = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._take)
+
+    def call(self) -> None:
+        """Ask for it."""
+        self.wanted = True
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
         if self.wanted:

@@ -25,6 +25,7 @@ from drivers.mavlink.link import open_link
 from drivers.mavlink.station import Identity, Station
 from hil.control import Control
 from hil.geoid import undulation
+from hil.link_stats import LinkStats
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
 from nav.errors import HilError
@@ -36,6 +37,8 @@ _READ_S = 0.1
 """A solution is read at least this often, for the status."""
 _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
+_TELL_S = 0.2
+"""What went over the links is told so often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,8 @@ class Taps:
         Of `FRAME`: takes measurements from the network to the loop.
     early : bool
         They serve the alignment as well.
+    links : LinkStats, optional
+        Told a few times a second what went over the links.
     """
 
     states: Ring
@@ -64,6 +69,7 @@ class Taps:
     control: Control
     aiding: Ring | None = None
     early: bool = False
+    links: LinkStats | None = None
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -111,6 +117,7 @@ class _Publisher:
     def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
         self._station, self._endpoints = station, endpoints
+        self._links, self._told_s = taps.links, -math.inf
         self._row = np.zeros(1, NAV_STATE)
         self._events, self._event_number = taps.events, 0
         self._notes = np.zeros(16, taps.events.dtype)
@@ -146,6 +153,9 @@ class _Publisher:
         if called or now_s - self._read_s > _READ_S:
             self._read(now_s)
         next_s = self._poll(now_s)
+        if self._links is not None and now_s - self._told_s > _TELL_S:
+            self._told_s = now_s
+            self._links.tell(self._endpoints)
         if self._hungry() and self._ring.count - self._seen == 1:  # a slow sensor: do not wait for its next solution
             self._read(now_s)
             next_s = self._poll(now_s)

@@ -14,7 +14,10 @@ from nav.errors import HilError
 
 
 def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: Connection) -> None:
-    """Record until the loop is done and the ring is empty; answers ``{"file", "frames", "lost"}`` or ``{"failed"}``."""
+    """Record until the loop is done or hands on no more, and the ring is empty.
+
+    Answers ``{"file", "frames", "lost"}`` or ``{"failed"}``.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ring, control, stats = outlets.frames, outlets.control, outlets.stats
     wake = ring.wakes[0]
@@ -25,7 +28,7 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
             ring.pull(batch, 0)  # loads the kernel; nothing is sent before we are ready
             answer.send({"ready": True})
             while True:
-                done = stats["phase"] in (Phase.DONE, Phase.FAILED)
+                done = stats["phase"] in (Phase.DONE, Phase.FAILED) or not control.recording
                 number = control.recorded
                 copied, first = ring.pull(batch, number)
                 if first > number:

@@ -1,6 +1,6 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
-    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, this process
+    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, dashboard, this process
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
 """
@@ -20,6 +20,8 @@ import numpy as np
 
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.control import run_part
+from hil.dashboard import Sources, Window, recording_name, run_dashboard
+from hil.link_stats import LinkStats
 from hil.publisher import Taps, run_publisher
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -31,8 +33,8 @@ from nav.state import NAV_STATE, Mode
 
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
-PUBLISHER_NICE = 10
-"""How far the publisher steps back behind the loop where processors are few."""
+NICE = {"publisher": 10, "dashboard": 5}
+"""How far a part steps back behind the loop where processors are few."""
 RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
@@ -73,6 +75,8 @@ class Session:
         Recording to write.
     publish : bool
         Send MAVLink on the links of the scenario.
+    window : Window, optional
+        Where the dashboard is served; None: nowhere.
     """
 
     def __init__(
@@ -82,8 +86,13 @@ class Session:
         feeder: tuple[Callable[..., None], Sequence[Any]] | None = None,
         record: Path | None = None,
         publish: bool = True,
+        window: Window | None = None,
     ) -> None:
         self.order = order
+        self.links = LinkStats(order.scenario.mavlink.links if publish else ())
+        self.recordings: list[dict[str, Any]] = []
+        """What became of the recordings that were asked for while running."""
+        self._window = window
         self.outlets = Outlets.make(recording=record is not None, readers=1)
         self._feeder = feeder
         self._record = record
@@ -113,34 +122,47 @@ class Session:
     ) -> None:
         self._end()
 
-    def _start(self) -> None:
-        scenario, outlets = self.order.scenario, self.outlets
+    def _launch(self, name: str, target: Callable[..., None], *args: Any) -> None:
         context = mp.get_context("forkserver")
-        context.set_forkserver_preload(["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"])
+        ours, theirs = context.Pipe()
+        process = context.Process(
+            target=run_part,
+            args=(self.outlets.control, NICE.get(name, 0), target, *args, theirs),
+            name=f"hil-{name}",
+            daemon=True,
+        )
+        process.start()
+        theirs.close()
+        self._parts[name] = _Part(name, process, ours)
 
-        def launch(name: str, target: Callable[..., None], *args: Any) -> None:
-            ours, theirs = context.Pipe()
-            process = context.Process(
-                target=run_part,
-                args=(outlets.control, PUBLISHER_NICE if name == "publisher" else 0, target, *args, theirs),
-                name=f"hil-{name}",
-                daemon=True,
-            )
-            process.start()
-            theirs.close()
-            self._parts[name] = _Part(name, process, ours)
+    def _launch_recorder(self, path: Path) -> None:
+        header = {"scenario": self.order.scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
+        self._launch("recorder", run_recorder, path, header, self.outlets)
 
+    def _start(self) -> None:
+        scenario, outlets, launch = self.order.scenario, self.outlets, self._launch
+        mp.get_context("forkserver").set_forkserver_preload(
+            ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
+        )
         if self._record is not None:
-            header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
-            launch("recorder", run_recorder, self._record, header, outlets)
+            self._launch_recorder(self._record)
         launch("loop", run_loop, self.order, outlets)
         if self._feeder is not None:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
+        if self._window is not None:
+            simulated = self._feeder is not None and self._feeder[0] is run_head
+            launch(
+                "dashboard",
+                run_dashboard,
+                self._window,
+                Sources(self.order, outlets, self.links, simulated=simulated, recorded=self._record is not None),
+            )
+            self._window.socket.close()  # the port lives as long as its process
         if self._publish and scenario.mavlink.links:
             live = self.order.paced and self.order.file is None
             network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early)
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, self.links)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
 
     def compiling(self) -> tuple[int, int]:
@@ -187,7 +209,26 @@ class Session:
                 self._feeder_ended, self._drained = time.monotonic(), frames
             if time.monotonic() - self._feeder_ended > DRAIN_S:
                 self.stop()
+        if self._record is None:
+            self._record_as_wanted()
         return self.outlets.stats["phase"] in (Phase.READY, Phase.RUNNING) and not self.outlets.control.stop
+
+    def _record_as_wanted(self) -> None:
+        """Begin or end a recording that was asked for while running."""
+        control, recorder = self.outlets.control, self._parts.get("recorder")
+        if recorder is None:
+            if control.record_since:
+                control.recorded = self.outlets.frames.count
+                control.recording = True
+                self._launch_recorder(Path(recording_name(control.record_since)))
+            return
+        if not control.record_since:
+            control.recording = False
+        if not recorder.process.is_alive():
+            recorder.read()
+            control.recording, control.record_since = False, 0
+            self.recordings.append(recorder.answers)
+            del self._parts["recorder"]
 
     def wait_ready(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Block until the loop listens; `on_wait` is called ten times a second."""
@@ -254,7 +295,7 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher"):
+        for name in ("loop", "feeder", "recorder", "publisher", "dashboard"):
             part = self._parts.get(name)
             if part is None:
                 continue
@@ -285,7 +326,7 @@ class Session:
         result["wall_s"], result["device_s"] = wall, device_s
         result["speed"] = device_s / wall if wall else 0.0
         result["latency_us"] = stats.latency_us()
-        for name in ("loop", "feeder", "publisher", "recorder"):
+        for name in ("loop", "feeder", "publisher", "recorder", "dashboard"):
             part = self._parts.get(name)
             if part is not None:
                 part.read()
@@ -294,6 +335,8 @@ class Session:
                     result.update(answers)
                 else:
                     result[name] = answers
+        if self.recordings:
+            result["recordings"] = self.recordings
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
         if self.problems:
             result["problems"] = self.problems

@@ -24,6 +24,7 @@ from hil.scenario import Scenario
 from hil.stats import Stats
 from hil.warmup import warm_head
 from hil.world.aiding import SimulatedAiding
+from hil.world.injection import Injection
 from hil.world.instruments import instruments
 from nav.errors import HilError
 from nav.increments import FloatArray, ImuIncrements
@@ -54,6 +55,8 @@ class SimulatedHead:
             hardware=SIMULATED,
             rotor_hz=head.rotor.spin_hz,
         )
+        self.injection: Injection | None = None
+        """Faults that it is told to have while it runs."""
         self._aiding, self._aiding_encoder = SimulatedAiding(scenario), AidingEncoder()
         self._slow_every = max(1, round(1.0 / self.step))
         self._chunk = max(1, min(self._slow_every, round(CHUNK_S / self.step)))
@@ -75,6 +78,8 @@ class SimulatedHead:
 
     def _samples(self, first: int, count: int) -> FrameArray:
         sensed = self._instruments.sense(first, count)
+        if self.injection is not None:
+            self.injection.sensed(first, sensed)
         counter = np.arange(first, first + count)
         ends = (counter + 1) * self.period_us
         if self._board is None:
@@ -127,7 +132,7 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
         for i, piece in enumerate(np.split(batch, starts[1:])):
             if not pacer.wait((first + i + 1) * head.step, cancelled):
                 return sent
-            port.send(piece)
+            port.send(piece if head.injection is None else head.injection.sent(first + i, piece))
             sent += 1
     return sent
 
@@ -141,6 +146,7 @@ def run_head(scenario: Scenario, paced: bool, control: Control, stats: Stats, an
     try:
         warm_head(scenario, lambda done: stats.__setitem__("warm_head", done))
         head = SimulatedHead(scenario)
+        head.injection = Injection(control, head.step)
         while not (control.go or control.stop):
             time.sleep(0.005)
         answer.send(feed(head, scenario, paced=paced, cancelled=lambda: control.stop))
