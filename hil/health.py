@@ -70,7 +70,7 @@ class HealthWriter:
         row, sums, now = self._row, self._sums, raw.time[-1]
         if isinstance(raw, HeadIncrements):
             _add(self._combiner.residual, raw.step, sums)
-        if 0.0 <= now - row["time"][0] < EVERY_S:
+        if 0.0 <= now - row["time"][0] < EVERY_S - 1e-6:
             return
         row["time"], row["bytes"], row["own_truth"] = now, self._bytes, own_truth
         if isinstance(raw, HeadIncrements):

@@ -22,7 +22,7 @@ TOKEN_VARIABLE = "HIL_DASHBOARD_TOKEN"
 SHORTEST_TOKEN = 16
 _TRIES = 20
 """Ports above the default one that are tried where it is in use."""
-_SEND_BUFFER = 1 << 16
+_SEND_BUFFER = 1 << 14
 """Bytes on their way to one browser, in the kernel: what a slow one still gets is not old."""
 _PACKAGES = ("starlette", "uvicorn", "websockets")
 

@@ -1,5 +1,6 @@
 """Faults that the simulated head is told to have while it runs, a second each: of its samples, and of what reaches the bus."""
 
+from drivers.can.dtg_head_emulator import ANGLE_LSB
 from drivers.can.frames import FrameArray
 from hil.control import Control, Injected
 from hil.world.instruments import Sensed
@@ -37,7 +38,7 @@ class Injection:
         if first < self._until[Injected.STUCK]:
             sensed.dtheta[:, _STUCK_AXIS] = self._stuck
         else:
-            self._stuck = float(sensed.dtheta[-1, _STUCK_AXIS])
+            self._stuck = ANGLE_LSB * round(sensed.dtheta[-1, _STUCK_AXIS] / ANGLE_LSB)  # the same number on the wire
         if first < self._until[Injected.BUILT_IN]:
             sensed.status[:] |= _GYRO_1
 
