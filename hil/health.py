@@ -19,7 +19,8 @@ HEALTH = np.dtype(
         ("parity_mean", "<f8"),  # parity residual since the last record, rad/s; NaN: none
         ("parity_peak", "<f8"),  # largest of a sample, without sign
         ("faults", "<i8", 7),  # `nav.instruments.redundancy.Fault` of each axis
-        ("bytes", "<i8"),  # of data in all frames since the start
+        ("frames", "<i8"),  # since the start
+        ("bytes", "<i8"),  # of data in them
         ("own_truth", "?"),  # the samples are of the scenario's own world
     ]
 )
@@ -59,10 +60,11 @@ class HealthWriter:
         self._ring, self._combiner = ring, combiner
         self._row = np.zeros(1, HEALTH)
         self._sums = np.zeros(3)
-        self._bytes = 0
+        self._frames = self._bytes = 0
 
     def count(self, batch: FrameArray) -> None:
-        """Count the data of frames."""
+        """Count frames and their data."""
+        self._frames += len(batch)
         self._bytes += _total(batch["length"])
 
     def take(self, raw: HeadIncrements | ImuIncrements, own_truth: bool) -> None:
@@ -72,7 +74,7 @@ class HealthWriter:
             _add(self._combiner.residual, raw.step, sums)
         if 0.0 <= now - row["time"][0] < EVERY_S - 1e-6:
             return
-        row["time"], row["bytes"], row["own_truth"] = now, self._bytes, own_truth
+        row["time"], row["frames"], row["bytes"], row["own_truth"] = now, self._frames, self._bytes, own_truth
         if isinstance(raw, HeadIncrements):
             row["temperature"], row["spin"], row["faults"] = raw.temperature[-1], raw.spin[-1], self._combiner.faults
         else:

@@ -282,7 +282,7 @@ class View:
         then, before = self._before
         if now_s - then < 1.0 and before:
             return
-        totals = {"samples": stats["samples"], "frames": stats["frames"], "bytes": int(self._health["bytes"][0])}
+        totals = {"samples": stats["samples"]} | {name: int(self._health[name][0]) for name in ("frames", "bytes")}
         totals |= self._sources.links.sent()
         totals |= {f"link{k}": int(one["sent"]) for k, one in enumerate(self._sources.links.links())}
         self._rates = {name: (totals[name] - before.get(name, totals[name])) / (now_s - then) for name in totals}
