@@ -282,14 +282,15 @@ class View:
         then, before = self._before
         if now_s - then < 1.0 and before:
             return
-        totals = {"samples": stats["samples"]} | {name: int(self._health[name][0]) for name in ("frames", "bytes")}
+        totals = {"samples": stats["samples"], "frames": stats["frames"]}
         totals |= self._sources.links.sent()
         totals |= {f"link{k}": int(one["sent"]) for k, one in enumerate(self._sources.links.links())}
         self._rates = {name: (totals[name] - before.get(name, totals[name])) / (now_s - then) for name in totals}
         self._before = now_s, totals
 
     def _bus(self) -> dict[str, float]:
-        frames_s, bytes_s = self._rates.get("frames", 0.0), self._rates.get("bytes", 0.0)
+        frames_s, health = self._rates.get("frames", 0.0), self._health[0]
+        bytes_s = frames_s * health["bytes"] / max(1, health["frames"])
         return {"frames_s": frames_s, "bytes_s": bytes_s, "load": bus_load(self._scenario.bus, frames_s, bytes_s)}
 
     def _sensor(self) -> dict[str, Any]:

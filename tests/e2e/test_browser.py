@@ -1,6 +1,7 @@
 """The window in a real browser: headless Chromium looks at a real ``hil run``."""
 
 import contextlib
+import json
 import os
 import re
 import select
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from websockets.sync.client import connect
 
 playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright, the Python package")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -179,8 +181,8 @@ def test_moving_attitude_is_drawn_within_two_seconds(page: Any, address: str) ->
     first = page.evaluate("document.getElementById('ours').toDataURL()")
     seen(page, f"document.getElementById('ours').toDataURL() !== {first!r}")
     assert page.evaluate(DRAWN, page.query_selector("#ours")) > 1000, "sky and earth"
-    angles = [float(text(page, f"a{k}")) for k in range(3)]
-    truth = [float(text(page, f"b{k}")) for k in range(3)]
+    rows = page.evaluate("['a', 'b'].map(row => [0, 1, 2].map(k => document.getElementById(row + k).textContent))")
+    angles, truth = ([float(one) for one in row] for row in rows)
     assert angles == pytest.approx(truth, abs=0.5), "the truth stands beside"
 
 
@@ -206,9 +208,20 @@ def test_plots_grow(page: Any, address: str) -> None:
 
 
 def test_updates_come_fifty_times_a_second_and_nothing_is_lost(page: Any, address: str) -> None:
-    """The best of several seconds: the machine may be busy with something else in the others."""
+    """As many as a bare client gets beside it; 45 and more, then, where the machine has time for fifty at all."""
     page.goto(address)
-    seen(page, "parseFloat(document.getElementById('updates').textContent) >= 45", 120.0)
+    seen(page, "parseFloat(document.getElementById('updates').textContent) > 0")
+    shown: list[float] = []
+    with connect(address.replace("http", "ws") + "live", proxy=None) as bare:
+        end, count = time.monotonic() + 8.0, 0
+        while time.monotonic() < end:
+            records = json.loads(bare.recv(timeout=60))
+            count += sum(record["k"] == "fast" for record in records)
+            if any(record["k"] == "slow" for record in records):
+                shown.append(float(text(page, "updates").split()[0]))
+    assert max(shown) > 0.7 * count / 8.0
+    if count / 8.0 > 48.0:
+        assert max(shown) >= 45.0
     assert text(page, "lost") == "0"
     assert text(page, "rate").endswith("Hz")
 
