@@ -73,7 +73,7 @@ def open_window(address: str | None, say: Callable[[str], None]) -> Window | Non
     Returns
     -------
     Window or None
-        None where the packages for it are not installed and nobody asked for it by name.
+        None where nobody asked for it by name and its packages are not installed or no port is to be had.
 
     Raises
     ------
@@ -90,7 +90,13 @@ def open_window(address: str | None, say: Callable[[str], None]) -> Window | Non
     wanted = os.environ.get(TOKEN_VARIABLE, "")
     if wanted and len(wanted) < SHORTEST_TOKEN:
         raise HilError(f"{TOKEN_VARIABLE}: at least {SHORTEST_TOKEN} characters, as `openssl rand -hex 16` makes them")
-    bound = _bind(address, host, port)
+    try:
+        bound = _bind(address, host, port)
+    except HilError as error:
+        if address is not None:
+            raise
+        say(f"no window: {error}")
+        return None
     local = ipaddress.ip_address(bound.getsockname()[0].partition("%")[0])
     shown = socket.gethostname() if local.is_unspecified else host
     token = wanted or ("" if local.is_loopback else secrets.token_urlsafe(24))
