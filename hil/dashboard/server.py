@@ -61,6 +61,8 @@ def run_dashboard(window: Window, sources: Sources, answer: Connection) -> None:
     config = uvicorn.Config(
         application(window, hub, over),
         log_config=None,
+        log_level="critical",  # what a stranger sends is no news on our terminal
+        limit_concurrency=4 * BROWSERS,
         access_log=False,
         server_header=False,
         ws="websockets-sansio",

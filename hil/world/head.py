@@ -1,8 +1,9 @@
 """The simulated sensor head: the scenario's motion through its instruments onto the bus, in a process of its own. What else the
 simulated world measures goes out between the samples.
 
-The frames depend on the scenario alone: the same scenario gives the same bytes at any speed. With a `driver` other than that of
-the DTG head they are those of the board of that driver: the same increments, as that board rounds them.
+The frames depend on the scenario alone, and on faults injected while it runs: the same scenario gives the same bytes at any
+speed. With a `driver` other than that of the DTG head they are those of the board of that driver: the same increments, as that
+board rounds them.
 """
 
 import math
