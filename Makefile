@@ -3,6 +3,9 @@
 #   make run   [ARGS="--duration 10"]   the bridge with its built-in scenario
 #   make test  [ARGS="-k ring"]         all tests, those on real SocketCAN included
 #   make studies                        the studies of several minutes, whole
+#   make fuzz  [TARGET="blf sbg"] [RUNS=1000000] [SECONDS=600]  atheris on the parsers, for hours; writes docs/fuzzing.md
+#   make reliability                    every fault once, measured; writes docs/reliability.md
+#   make soak  [MINUTES=30]             1 kHz with random faults: accounting, recording and memory are checked at the end
 #   make lint                           ruff, mypy, import rules
 #   make dev                            .venv with everything that a developer needs
 #   make vcan                           install what the SocketCAN tests need on a kernel without CAN (Debian, root or sudo)
@@ -12,6 +15,7 @@
 SHELL := /bin/bash
 PYTHON ?= python3
 ARGS ?=
+MINUTES ?= 30
 
 # Installs $$packages.
 define INSTALL
@@ -21,7 +25,7 @@ define INSTALL
 	install 2>/dev/null || { $$root apt-get update -qq && install; }
 endef
 
-.PHONY: run test studies lint dev vcan browser clean
+.PHONY: run test studies fuzz reliability soak lint dev vcan browser clean
 .DELETE_ON_ERROR:
 
 run: .venv/.installed-run
@@ -33,6 +37,15 @@ test: .venv/.installed-test
 studies: .venv/.installed-test
 	@.venv/bin/python -m pytest -m study $(ARGS)
 
+fuzz: .venv/.installed-fuzz
+	@.venv/bin/python tests/fuzz/run.py --runs $(or $(RUNS),1000000) --seconds $(or $(SECONDS),0) $(TARGET)
+
+reliability: .venv/.installed-test
+	@tools/reliability.sh
+
+soak: .venv/.installed-run
+	@tools/soak.sh $(MINUTES) $(ARGS)
+
 lint: .venv/.installed-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
@@ -42,8 +55,9 @@ lint: .venv/.installed-dev
 dev: .venv/.installed-dev
 
 .venv/.installed-run: EXTRAS = dashboard,logs
-.venv/.installed-test: EXTRAS = dashboard,logs,plot,magnetic,test
-.venv/.installed-dev: EXTRAS = dashboard,logs,plot,magnetic,test,dev
+.venv/.installed-test: EXTRAS = dashboard,logs,plot,magnetic,mcap,test
+.venv/.installed-fuzz: EXTRAS = logs,magnetic,test,fuzz
+.venv/.installed-dev: EXTRAS = dashboard,logs,plot,magnetic,mcap,test,dev
 
 .venv/.installed-%: pyproject.toml constraints.txt | .venv/bin/pip
 	@echo "Installing dtg-hil[$(EXTRAS)] into .venv (takes a minute or so the first time) ..."
@@ -69,5 +83,5 @@ browser:
 	$(INSTALL)
 
 clean:
-	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .coverage
+	rm -rf .venv .fuzz build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .coverage
 	find hil drivers nav fixtures tests -name __pycache__ -prune -exec rm -rf {} +

@@ -36,6 +36,10 @@ class Counters:
     """Frames of another protocol version; dropped."""
     restarts: int = 0
     """Times the board started anew."""
+    frozen: int = 0
+    """Samples whose counter stood still while their time went on; dropped, and in `lost` once the counter goes on."""
+    clock_steps: int = 0
+    """Times the board's clock jumped while its counter went on; the time of the samples goes on with the counter."""
 
     def as_list(self) -> list[int]:
         """The counts in the order of the fields."""

@@ -4,9 +4,9 @@
          \\-> aiding (to the navigator)                            \\-> frames ring (recorder)
 
 Every batch of frames runs through `Loop.take`; nothing in it depends on how frames were batched: a measurement is taken
-between the samples between which it came. Measurements from the network come as frames too, in a ring of the publisher's,
-and are recorded like those of the bus. What the loop does on its own account (silence, an ordered alignment) goes into the
-recording as an event, so that a replay repeats it.
+between the samples between which it came. Measurements from the network and from receivers at ports of their own come as
+frames too, each in a ring of its sender's, and are recorded like those of the bus. What the loop does on its own account
+(silence, an ordered alignment) goes into the recording as an event, so that a replay repeats it.
 """
 
 import gc
@@ -15,6 +15,7 @@ import math
 import signal
 import time
 from dataclasses import dataclass, field, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -25,22 +26,25 @@ from numpy.typing import NDArray
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, is_aiding
 from drivers.can.frames import FrameArray, frames
-from drivers.clock import ClockMap
 from drivers.logs.recording import EVENT, MARK, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
+from hil.clock import LoopClock
 from hil.control import Control
 from hil.health import HEALTH, HealthWriter
 from hil.magnetometer import correct
+from hil.other_attitude import Estimator, OtherAttitude
+from hil.realtime import claim
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
 from hil.settings import settings_of
 from hil.source import BusSource, FileSource, Source
-from hil.stats import Phase, Stats
+from hil.stats import Phase, Stats, Times
 from hil.warmup import warm_loop
+from hil.wire_watch import WireWatch
 from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
-from nav.aiding import Kind
+from nav.aiding import AIDING, Kind, of_receivers
 from nav.errors import HilError
 from nav.filter.record import Recorder
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
@@ -76,6 +80,8 @@ class LoopOrder:
         Give our attitudes back with the result (``trace``: times, attitudes).
     own_world : bool
         The samples are of the scenario's own world, also where the board cannot say so.
+    realtime : bool
+        Claim priority, locked memory and a processor (:mod:`hil.realtime`).
     """
 
     scenario: Scenario
@@ -84,6 +90,12 @@ class LoopOrder:
     reference: Reference | None = None
     keep_trace: bool = False
     own_world: bool = False
+    realtime: bool = False
+
+    @property
+    def live(self) -> bool:
+        """In real time on a bus: what comes from elsewhere now belongs to the samples that come now."""
+        return self.paced and self.file is None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,23 +105,26 @@ class Outlets:
     states: Ring
     frames: Ring
     events: Ring
-    aiding: Ring
-    """Frames of measurements that the publisher has taken from the network."""
+    aiding: tuple[Ring, ...]
+    """Frames of measurements, a ring a writer: that of the publisher, then those of the receivers."""
+    fixes: Ring
+    """What receivers have measured, for the publisher."""
     health: Ring
     """What the loop says of the sensor a few times a second: of `hil.health.HEALTH`."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
 
     @staticmethod
-    def make(*, recording: bool, readers: int) -> "Outlets":
-        """New rings, with `readers` wake-ups for solutions and one for frames."""
+    def make(*, recording: bool, readers: int, receivers: int = 0) -> "Outlets":
+        """New rings, with `readers` wake-ups for solutions and one for frames; `receivers` have one more each."""
         from drivers.can.frames import FRAME
 
         outlets = Outlets(
             Ring(NAV_STATE, 8192, readers),
             Ring(FRAME, 1 << 16, 1),
             Ring(EVENTS, 256, 1),
-            Ring(FRAME, 1024, 0),
+            tuple(Ring(FRAME, 1024, 0) for _ in range(1 + receivers)),
+            Ring(AIDING, 64, 0),
             Ring(HEALTH, 16, 0),
         )
         outlets.control.recording = recording
@@ -126,6 +141,9 @@ class Loop:
         self.navigator = Navigator(settings_of(scenario), recorder)
         self.finished = False
         """The scenario's duration is over."""
+        self.samples = 0
+        """Navigated so far."""
+        self._watch = WireWatch(self.driver.counters, scenario.bus)
         self._aiding = AidingDecoder()
         self._now: float | None = None
         """Device time of the newest sample."""
@@ -133,25 +151,26 @@ class Loop:
         """Device time at which the first sample began."""
         self._withheld = 0
         self._combiner = HeadCombiner(head_model(scenario.head))
-        self._mounting = mounting(scenario.head) if any(scenario.head.mounting_deg) else None
+        turn = mounting(scenario.head)
+        self._mounting = None if (turn == np.eye(3)).all() else turn
         calibration = validated(scenario.head.calibration or NO_HEAD, "in the loop")
         self._calibrated = calibration.serial or None  # 0: of no particular head
         self._magnetometer = calibration.magnetometer
         self._outlets = outlets
-        self._live = order.paced and order.file is None
+        self._live = order.live
         self._own_truth = TruthKeeper(scenario)  # made now: it takes tens of milliseconds
         self._truth = self._own_truth if order.own_world else None
         self._from_truth = scenario.navigation.alignment == "truth"
         self._trace = Trace() if order.reference is not None else None
         self._reference = order.reference
+        self._other = OtherAttitude(self.driver) if isinstance(self.driver, Estimator) else None
         self._keep_trace = order.keep_trace
-        self._clock = ClockMap()
+        self._clock = LoopClock(outlets.stats, partial(self.navigator.tell, station=True))
         self._restarts = 0
         self._arrival_ns = 0
         self._started: float | None = None
         self._covered = 0.0
         self._marked = 0
-        self._samples = 0
         self._align_requests, self._marks = outlets.control.align_requests, outlets.control.marks
         self._health = HealthWriter(outlets.health, self._combiner)
         self._world = scenario.world_id()
@@ -169,11 +188,13 @@ class Loop:
     def _between(self, batch: FrameArray) -> bool:
         """Take frames, the measurements among them in their place between the samples."""
         aided = is_aiding(batch["can_id"])
-        if not aided.any():
+        if np.count_nonzero(aided) == 0:
             return len(batch) > 0 and self._take(batch)
         rows, places = self._aiding.decode(batch, self._now)
         if self._magnetometer is not None:
             correct(self._magnetometer, rows)
+        if (fixes := of_receivers(rows)).any():
+            self._outlets.fixes.push(rows[fixes])
         cuts = np.flatnonzero(aided[1:] & ~aided[:-1]) + 1
         got, start, taken = False, 0, 0
         for stop in (*cuts.tolist(), len(batch)):
@@ -199,7 +220,7 @@ class Loop:
         driver = self.driver
         raw = driver.decode(batch)
         if len(raw) == 0:
-            self._count()
+            self._count(batch)
             return False
         self._now = float(raw.time[-1])
         if self._first is None:
@@ -213,7 +234,7 @@ class Loop:
             self._clock.reset()
             self._started = None
         self._pass(raw.rows(start, len(raw)), arrivals[start:])
-        self._count()
+        self._count(batch)
         return True
 
     def _pass(self, raw: HeadIncrements | ImuIncrements, arrivals: IntArray) -> None:
@@ -221,7 +242,7 @@ class Loop:
         if self.finished:
             return
         raw = self._cut(raw)
-        self._samples += len(raw)
+        self.samples += len(raw)
         if len(raw) == 0:
             return
         if self._truth is None and self.driver.world_id == self._world:
@@ -230,14 +251,14 @@ class Loop:
             return
         imu = self._combine(raw) if isinstance(raw, HeadIncrements) else self._turned(raw)
         rows = self.navigator.process(imu)
-        rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
-        self._arrival_ns = int(arrivals[-1])
+        self._arrival_ns = arrival = int(arrivals[-1])
+        rows["arrival_ns"] = arrival if len(rows) != len(arrivals) else arrivals
         self._publish(rows)
         self._health.take(raw, self._truth is not None)
         stats = self._outlets.stats
         if self._live:
-            stats.add_latencies(time.time_ns() - arrivals)
-            stats["age_us"] = round(1e6 * self._clock.update(float(imu.time[-1]), arrivals[-1]))
+            stats.count_since(Times.LATENCY, time.time_ns(), arrivals)
+            self._clock.take(float(imu.time[-1]), arrival)
         if len(rows) != len(imu):
             stats["interpolated"] += len(rows) - len(imu)
 
@@ -327,22 +348,34 @@ class Loop:
         outlets.states.push(rows)
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
-            note = np.zeros(1, EVENTS)
-            note["time"], note["severity"], note["station"] = event.time, event.severity.encode(), event.station
-            note["text"] = event.text.encode()[:240]
-            outlets.events.push(note)
+            self._note(event.time, event.severity, event.text, event.station)
         if self._truth is not None and len(rows):
             self._truth.compare(rows)
             if self._truth.position.count:
                 outlets.stats["position_error_mm"] = round(min(self._truth.position.final, 1e12) * 1000.0)
         if self._trace is not None:
             self._trace.add(rows)
+        if self._other is not None and len(rows):
+            self._other.compare(rows)
 
-    def _count(self) -> None:
+    def _count(self, batch: FrameArray) -> None:
         counters = self.driver.counters
-        self._outlets.stats.set_block("frames", counters.as_list())
-        self._outlets.stats["samples"] = self._samples  # not those of the last batch that lie beyond the duration
-        self._outlets.control.set_loss(counters.lost, self._samples)
+        counts = counters.as_list()
+        self._outlets.stats.set_block("frames", counts)
+        self._outlets.stats["samples"] = self.samples  # not those of the last batch that lie beyond the duration
+        self._outlets.control.set_loss(counters.lost, self.samples)
+        for said in self._watch.look(batch, counts, self._now or 0.0):
+            self.say(said.severity, said.text, station=said.station)
+
+    def say(self, severity: str, text: str, *, station: bool = False) -> None:
+        """Tell the user something that is not of the navigator's."""
+        self._note(self._now or 0.0, severity, text, station)
+
+    def _note(self, time_s: float, severity: str, text: str, station: bool) -> None:
+        note = np.zeros(1, EVENTS)
+        note["time"], note["severity"], note["station"] = time_s, severity.encode(), station
+        note["text"] = text.encode()[:240]
+        self._outlets.events.push(note)
 
     def result(self) -> dict[str, Any]:
         """What the summary needs beyond the shared counters."""
@@ -354,6 +387,10 @@ class Loop:
             "failed_axes": self._combiner.failed(),
             "aiding": {kind.name: count for kind, count in self._aiding.heard.items() if count},
         }
+        if errors := self._watch.errors.as_dict():
+            result["bus_errors"] = errors
+        if self._other is not None:
+            result["other_attitude"] = self._other.summary()
         if self._withheld:
             result["withheld"] = self._withheld
         if self._aiding.counters.frames:
@@ -361,7 +398,7 @@ class Loop:
             result["aiding_faults"] = {name: faults[name] for name in AIDING_FAULTS}
         if self._truth is not None and (error := self._truth.summary()) is not None:
             result["error"] = error
-        if self._samples and (sigma := _totals(self._last()["sigma"].astype(float))) is not None:
+        if self.samples and (sigma := _totals(self._last()["sigma"].astype(float))) is not None:
             result["estimate"] = {"sigma": sigma, "ratio": self._truth.ratios() if self._truth is not None else {}}
         if self._trace is not None and self._reference is not None:
             result.update(self._reference.differences(self._trace))
@@ -399,11 +436,18 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         try:
             gc.collect()
             gc.freeze()
+            granted = claim() if order.realtime else None
+            for lack in granted.lacking if granted else ():
+                loop.navigator.tell(0.0, "warning", lack)
+            outlets.control.loop_begins()
             stats["phase"] = Phase.READY
             _run(loop, source, order, outlets)
         finally:
+            outlets.control.loop_ends()
             source.close()
-        result = loop.result()
+        result = loop.result() | {"overflowed": source.overflowed}
+        if granted:
+            result["realtime"] = granted.as_dict()
         if source.problem():
             result["problem"] = source.problem()
         stats["phase"] = Phase.DONE
@@ -421,13 +465,19 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
     heard: int | None = None
     stats, control = outlets.stats, outlets.control
-    relayed, relayed_number = frames(BATCH), 0
+    relayed, relayed_numbers = frames(BATCH), [0] * len(outlets.aiding)
+    trouble = ""
     while not (control.stop or loop.finished or source.exhausted):
         n = source.receive(batch, wait)
         now = time.monotonic_ns()
         stats["beat_ns"] = now
+        if source.trouble != trouble:
+            trouble = source.trouble
+            loop.say("error" if trouble else "notice", trouble or f"{order.scenario.bus} is back", station=True)
         if n:
-            taken = batch[:n]
+            taken, samples = batch[:n], loop.samples
+            if source.live:
+                stats.count(Times.WAKE, time.time_ns() - int(taken["time_ns"][n - 1]))
             _record(taken, outlets, order.paced)
             if order.file is not None and taken["reserved"][:, 0].any():
                 got = take_with_events(loop, taken)
@@ -436,11 +486,17 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             if got:
                 heard = now
                 stats["phase"] = Phase.RUNNING
-        if outlets.aiding.count > relayed_number:
-            copied, first = outlets.aiding.pull(relayed, relayed_number)
-            relayed_number = first + copied
-            _record(relayed[:copied], outlets, order.paced)
-            loop.take(relayed[:copied])
+            if source.live:
+                took = time.monotonic_ns() - now
+                stats.count(Times.ROUND, took)
+                if got and took > 1e9 * (loop.samples - samples) * (loop.driver.period_s or math.inf):
+                    stats["overruns"] += 1
+        for k, ring in enumerate(outlets.aiding):
+            if ring.count > relayed_numbers[k] and not loop.finished:
+                copied, first = ring.pull(relayed, relayed_numbers[k])
+                relayed_numbers[k] = first + copied
+                _record(relayed[:copied], outlets, order.paced)
+                loop.take(relayed[:copied])
         event = loop.ordered_event()
         if source.live and heard is not None and now - heard > silence_ns:
             heard = None

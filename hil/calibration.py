@@ -7,7 +7,6 @@ The gyro lists stand in the order g1x, g1y, g2y, g2z, the accelerometer lists in
 import datetime
 import json
 import math
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +14,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
 from hil.scenario import Finite, RotorConfig, Vector, explained
+from hil.toml import read_toml
 from nav.earth import STANDARD_GRAVITY as _G
 from nav.errors import HilError
 from nav.instruments.accelerometer_errors import AccelerometerErrors
@@ -275,13 +275,9 @@ def read(path: Path) -> CalibrationFile:
     HilError
         The file cannot be read, is not TOML, or a key is unknown or has a wrong value.
     """
-    try:
-        table = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise HilError(f"calibration {path}: {error.strerror}; `hil calibrate` makes one") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise HilError(f"calibration {path}: not TOML: {error}") from error
-    return validated(table, str(path))
+    if not path.exists():
+        raise HilError(f"calibration {path}: No such file or directory; `hil calibrate` makes one")
+    return validated(read_toml(path, f"calibration {path}"), str(path))
 
 
 def validated(table: Mapping[str, Any], source: str) -> CalibrationFile:

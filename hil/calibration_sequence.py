@@ -5,7 +5,6 @@
 
 import datetime
 import math
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
@@ -15,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from drivers.logs.recording import RecordingWriter
 from hil.scenario import Finite, NotNegative, Scenario, Vector, explained, validated
+from hil.toml import read_toml
 from hil.world.head import SimulatedHead
 from nav.errors import HilError
 from nav.increments import FloatArray
@@ -130,11 +130,7 @@ def read_sequence(path: Path) -> SequenceConfig:
         The file cannot be read, is not TOML, or a key is unknown or has a wrong value.
     """
     try:
-        return SequenceConfig.model_validate(tomllib.loads(path.read_text()))
-    except OSError as error:
-        raise HilError(f"sequence {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise HilError(f"sequence {path}: not TOML: {error}") from error
+        return SequenceConfig.model_validate(read_toml(path, f"sequence {path}"))
     except ValidationError as error:
         raise HilError(explained(error, f"sequence {path}")) from error
 
@@ -195,6 +191,8 @@ def simulate(
             table["head"] |= {
                 "errors_seed": seed,
                 "mounting_deg": (0, 0, 0),
+                "axes": None,
+                "mounting": None,
                 "lever_arm_m": (0, 0, 0),
                 "calibration": None,
             }

@@ -12,17 +12,23 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from hil import cli_watch
 from nav.errors import HilError
 
 if TYPE_CHECKING:
     from hil.bridge import LoopOrder
     from hil.dashboard import Window
+    from hil.scenario import Scenario
     from hil.session import Session
 
 COMMON_BUS = "unix:dtg-hil"
 """Where `hil imu` and `hil run --imu` meet when no bus is named."""
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+
+
+app.command()(cli_watch.check_axes)
+app.command()(cli_watch.monitor)
 
 
 class RunFailed(HilError):
@@ -38,7 +44,15 @@ Links = Annotated[
     list[str] | None,
     typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
+Key = Annotated[
+    Path | None, typer.Option("--mavlink-key", help="Sign MAVLink with the key in this file, take nothing unsigned.")
+]
+Tlog = Annotated[Path | None, typer.Option(help="Log the first MAVLink link to this file (.tlog).")]
+Mcap = Annotated[Path | None, typer.Option(help="Write solutions and events for Foxglove to this file (.mcap).")]
 Record = Annotated[Path | None, typer.Option(help="Write what comes in to this recording (.dhil).")]
+Realtime = Annotated[
+    bool, typer.Option("--realtime", help="Priority, locked memory and a processor for the loop, where permitted.")
+]
 Asserts = Annotated[
     list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
 ]
@@ -59,11 +73,18 @@ def run(
     scenario: ScenarioName = None,
     bus: Bus = None,
     imu: Annotated[str | None, typer.Option(help="Driver of the board on the bus; then no head is simulated.")] = None,
+    gnss: Annotated[
+        list[str] | None, typer.Option(help="Port of a satellite receiver, serial:/dev/ttyACM0:115200; repeatable.")
+    ] = None,
     mavlink: Links = None,
     duration: Duration = None,
     speed: Speed = "1",
     seed: Seed = None,
     record: Record = None,
+    realtime: Realtime = False,
+    mavlink_key: Key = None,
+    tlog: Tlog = None,
+    mcap: Mcap = None,
     assertion: Asserts = None,
     junit: Junit = None,
     dashboard: Dashboard = None,
@@ -79,11 +100,21 @@ def run(
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
     )
+    if gnss:
+        chosen = chosen.with_receivers(gnss)
+    chosen = _links(chosen, mavlink_key, tlog)
     outside = bool(chosen.bus) or imu is not None
     if outside and not _paced(speed):
         raise HilError(
             "--speed max needs the simulated head of `hil run`: leave --bus, --imu and the scenario's bus out"
         )
+    if chosen.receiver and not _paced(speed):
+        raise HilError("--speed max has no time in which a receiver could speak: leave it or the receivers out")
+    for receiver in chosen.receiver:
+        from drivers.serial.probe import check_receiver
+
+        if warning := check_receiver(receiver.port):
+            _say(warning)
     if chosen.bus.startswith("serial:"):
         from drivers.serial.probe import check_port
 
@@ -93,9 +124,11 @@ def run(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
         own_world=not outside,
+        realtime=realtime,
     )
     screen = _Screen(dashboard, no_dashboard, tui)
-    _run(order, None if outside else simulated_head(order), record, assertion, junit, screen=screen, as_json=as_json)
+    feeder = None if outside else simulated_head(order)
+    _run(order, feeder, record, assertion, junit, screen=screen, mcap=mcap, as_json=as_json)
 
 
 @app.command()
@@ -105,16 +138,20 @@ def imu(
     duration: Duration = None,
     speed: Speed = "1",
     seed: Seed = None,
+    realtime: Realtime = False,
     as_json: Json = False,
 ) -> None:
     """Run the simulated sensor head alone, for a bridge in another process or on another machine."""
+    from hil.realtime import claim
     from hil.scenario import load
     from hil.world.head import SimulatedHead, feed
 
     chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
     chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
-    stop = _StopSignal()
+    stop = StopSignal()
     head = SimulatedHead(chosen)
+    for lack in claim().lacking if realtime else ():
+        _say(lack)
     _say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
     result = feed(head, chosen, paced=_paced(speed), cancelled=lambda: stop.wanted)
     _report({"scenario": chosen.name, **result}, as_json=as_json)
@@ -128,6 +165,10 @@ def replay(
     mavlink: Links = None,
     speed: Speed = "1",
     record: Record = None,
+    realtime: Realtime = False,
+    mavlink_key: Key = None,
+    tlog: Tlog = None,
+    mcap: Mcap = None,
     plot: Annotated[Path | None, typer.Option(help="Plot the attitude difference to this file (.svg, .png).")] = None,
     withhold: Annotated[
         list[str] | None,
@@ -149,7 +190,8 @@ def replay(
     from hil.player import plan_replay, run_player
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
-    order = replace(order, scenario=order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold)))
+    changed = order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold))
+    order = replace(order, scenario=_links(changed, mavlink_key, tlog), realtime=realtime)
     if plot is not None:
         if order.reference is None:
             raise HilError(f"--plot: {log} carries no attitude to compare with")
@@ -167,7 +209,7 @@ def replay(
         return {"smoothed": smooth_recording(log, order.scenario, smooth)}
 
     screen = _Screen(dashboard, no_dashboard, tui)
-    summary = _run(order, feeder, record, assertion, junit, smoothed, screen=screen, as_json=as_json)
+    summary = _run(order, feeder, record, assertion, junit, smoothed, screen=screen, mcap=mcap, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -242,13 +284,18 @@ def decode(
 @app.command()
 def export(
     file: Annotated[Path, typer.Argument(help="Recording of frames.")],
-    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet.")],
+    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet; or .mcap.")],
     imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the samples of a recording as a table, a column a signal."""
+    """Write the samples of a recording as a table, a column a signal; or its navigation for Foxglove (.mcap)."""
     import numpy as np
 
+    if out.suffix == ".mcap":
+        from hil.mcap_recorder import export_mcap
+
+        _report(export_mcap(file, imu, out), as_json=as_json)
+        return
     from hil.samples import read_samples
     from hil.tables import write_table
 
@@ -290,6 +337,27 @@ def allan(
 
 
 @app.command()
+def clock(
+    file: Annotated[Path, typer.Argument(help="Recording of a live run.")],
+    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Plot arrivals, fit, bound and steps (.svg, .png).")] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the clock of a recorded board with the host's: offset, drift, bound, steps."""
+    from hil.clock_log import clock_log
+    from hil.plot import check_plot, plot_clock
+
+    if plot is not None:
+        check_plot(plot)
+    log = clock_log(file, imu)
+    if plot is not None:
+        plot_clock(plot, log, file.name)
+    _report({"file": str(file), **log.summary()}, as_json=as_json)
+    if log.problem:
+        raise RunFailed(log.problem)
+
+
+@app.command()
 def record(
     file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
     bus: Annotated[str, typer.Option(help="Bus URL.")],
@@ -301,9 +369,9 @@ def record(
     from hil.decoder import record_bus
     from hil.scenario import load
 
-    stop = _StopSignal()
+    stop = StopSignal()
     chosen = load(scenario).with_changes(bus=bus)
-    _report(record_bus(chosen, file, duration, lambda: stop.wanted), as_json=as_json)
+    _report(record_bus(chosen, file, duration, lambda: stop.wanted, _say), as_json=as_json)
 
 
 @app.command()
@@ -384,7 +452,9 @@ def _calibrate(
 
 @app.command()
 def configure(
-    driver: Annotated[str, typer.Argument(help="Driver of the board: xsens-xbus, vectornav, microstrain-mip.")],
+    driver: Annotated[
+        str, typer.Argument(help="xsens-xbus, vectornav, microstrain-mip, or ubx for a receiver of u-blox.")
+    ],
     bus: Annotated[str, typer.Option(help="serial:/dev/ttyUSB0:921600")],
     rate: Annotated[float, typer.Option(min=0.0, help="Samples a second, Hz.")],
     as_json: Json = False,
@@ -397,7 +467,7 @@ def configure(
 
 @app.command()
 def doctor(
-    probe: Annotated[bool, typer.Option("--probe", help="Listen on every serial port for known boards.")] = False,
+    probe: Annotated[bool, typer.Option("--probe", help="Listen on CAN and serial ports for known boards.")] = False,
     as_json: Json = False,
 ) -> None:
     """Say what this machine can do, and the command that mends each lack."""
@@ -449,11 +519,18 @@ def study(
 
 
 @app.command()
-def bench(as_json: Json = False) -> None:
-    """Measure the speed of each part on this machine."""
+def bench(
+    live: Annotated[
+        bool, typer.Option("--live", help="The live chain with its processes instead of its parts.")
+    ] = False,
+    seconds: Annotated[float, typer.Option(min=2.0, help="Of each run of --live.")] = 20.0,
+    as_json: Json = False,
+) -> None:
+    """Measure the speed of each part on this machine, or of the live chain."""
     from hil.bench import measure
+    from hil.bench.live import rows as live_rows
 
-    rows = measure(_say)
+    rows = live_rows(_say, seconds) if live else measure(_say)
     if as_json:
         print(json.dumps({"rows": rows}))
         return
@@ -461,6 +538,8 @@ def bench(as_json: Json = False) -> None:
         ratio = "" if row["ratio_to_c"] is None else f"   {row['ratio_to_c']:.2f} of C"
         if row["peer_ns"] is not None:
             ratio += f"   {row['peer']}: {row['peer_ns']:.0f} ns ({row['peer_ns'] / row['ns']:.1f} x)"
+        if "p99_ns" in row:
+            ratio += f"   p99 {row['p99_ns']:.0f} ns   lost {row['lost']} of {row['samples']}"
         print(f"{row['id']:36} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
@@ -499,6 +578,7 @@ def _run(
     more: Callable[[], dict[str, Any]] = dict,
     *,
     screen: _Screen,
+    mcap: Path | None = None,
     as_json: bool,
 ) -> dict[str, Any]:
     """Run a session to its end, show it with what `more` adds, check the assertions; the summary."""
@@ -512,8 +592,8 @@ def _run(
         raise HilError("--junit needs at least one --assert")
     if screen.tui:
         check_terminal()
-    stop = _StopSignal()
-    session = Session(order, feeder=feeder, record=record_to, window=screen.open(paced=order.paced))
+    stop = StopSignal()
+    session = Session(order, feeder=feeder, record=record_to, mcap=mcap, window=screen.open(paced=order.paced))
     with session, TerminalView(session, stop.call) if screen.tui else RunView(session) as view:
         while not (session.ready or stop.wanted):
             view.show_compiling()
@@ -543,15 +623,15 @@ def _run(
     return summary
 
 
-def _follow(session: "Session", stop: "_StopSignal", view: Any) -> None:
+def _follow(session: "Session", stop: "StopSignal", view: Any) -> None:
     while session.running:
         if stop.wanted:
             session.stop()
         view.refresh(time.monotonic())
-        time.sleep(0.1)
+        session.wait(0.1)
 
 
-class _StopSignal:
+class StopSignal:
     """Ctrl-C or SIGTERM asks for a clean stop; a second one ends at once."""
 
     def __init__(self) -> None:
@@ -573,6 +653,15 @@ def _paced(speed: str) -> bool:
     if speed not in {"1", "max"}:
         raise HilError(f"--speed {speed}: expected 1 or max")
     return speed == "1"
+
+
+def _links(scenario: "Scenario", key: Path | None, tlog: Path | None) -> "Scenario":
+    from hil.cli_mavlink import open_doors, with_mavlink
+
+    chosen = with_mavlink(scenario, key, tlog)
+    for line in open_doors(chosen):
+        _say(line)
+    return chosen
 
 
 def _changes(mavlink: list[str] | None = None, withhold: list[str] | None = None, **options: Any) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from hil.clock import clock_reading
 from hil.session import Session
 from nav.rotation import euler_from_quaternion
 from nav.state import Health, Mode
@@ -32,6 +33,7 @@ class RunView:
         self._last_s = 0.0
         self._plain_s = 0.0
         self._said_compiling = False
+        self._problems = 0
 
     def __enter__(self) -> "RunView":
         if self._terminal:
@@ -60,6 +62,9 @@ class RunView:
         """Print what happened."""
         for time, severity, text in self._session.events():
             self._console.print(f"[{_COLOURS.get(severity, 'white')}]{time:10.3f} s  {escape(text)}[/]")
+        for problem in self._session.problems[self._problems :]:
+            self._console.print(f"[{_COLOURS['error']}]{escape(problem)}[/]")
+            self._problems += 1
 
     def refresh(self, now_s: float) -> None:
         """Print events and renew the status line."""
@@ -84,6 +89,8 @@ class RunView:
             f"age {stats['age_us'] / 1000:.2f} ms",
             f"lost {stats['lost']}",
         ]
+        if (clock := clock_reading(stats)) is not None:
+            parts.append(f"clock {clock.drift_ppm:+.1f} ppm")
         if mode == Mode.ALIGN:
             parts.append(f"ALIGN {100 * float(state['progress']):.0f} %")
         else:
@@ -127,10 +134,25 @@ def print_summary(summary: dict[str, Any]) -> None:
         ("MAVLink messages sent", str(sum(summary["mavlink_sent"].values()))),
     ):
         table.add_row(name, value)
+    if (clock := summary.get("clock", {})).get("bound_us") is not None:
+        own = f"{clock['drift_ppm']:+.3f} ppm, known to {clock['bound_us']:.3g} us, {clock['steps']} steps"
+        table.add_row("clock of the device", own)
     if "estimate" in summary:
         sigma = summary["estimate"]["sigma"]
         own = f"{sigma['position_m']:.3g} m, {sigma['velocity_ms']:.3g} m/s, {sigma['attitude_deg']:.3g} deg"
         table.add_row("own sigma at the end", own)
+    if summary["frozen"] or summary["clock_steps"]:
+        table.add_row("frozen counter, clock steps", f"{summary['frozen']}, {summary['clock_steps']}")
+    if "bus_errors" in summary:
+        table.add_row("CAN controller", ", ".join(f"{name} {count}" for name, count in summary["bus_errors"].items()))
+    if summary.get("overflowed"):
+        table.add_row("frames dropped by the kernel", str(summary["overflowed"]))
+    for receiver in summary.get("receivers", []):
+        refused = ", ".join(f"{count} {reason}" for reason, count in receiver.get("refused", {}).items())
+        fixes = (
+            f"{receiver.get('fixes', 0)} fixes by {receiver.get('speaks') or 'nothing'}; refused: {refused or 'none'}"
+        )
+        table.add_row(f"receiver at {escape(receiver.get('port', '?'))}", fixes)
     if "recorder" in summary:
         recorder = summary["recorder"]
         table.add_row("recorded", f"{recorder['frames']} frames to {recorder['file']}, {recorder['lost']} lost")

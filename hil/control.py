@@ -1,7 +1,7 @@
 """A few numbers that the processes of a run tell each other: one block of shared memory, nobody waits on it.
 
 Orders (stop, go, align, mark, record, faults) come from the session, the publisher and the dashboard, the loss of samples from
-the loop, the count of recorded frames from the recorder.
+the loop, the count of recorded frames from the recorder. The readers of the rings give a beat; nobody waits for it.
 """
 
 import multiprocessing as mp
@@ -15,11 +15,15 @@ from typing import Any
 
 import numpy as np
 
+from hil.realtime import step_aside
 from hil.ring import Shared
 
-_STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _MARKS, _RECORDING, _RECORD_SINCE, _FAULT, _FAULTS, _FIELDS = (
-    range(12)
+_STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _LOOP_PID, _LOOP_DONE, _PUBLISHER, _RECORDER, *_REST = range(
+    16
 )
+_MARKS, _RECORDING, _RECORD_SINCE, _FAULT, _FAULTS, _FIELDS = _REST
+READERS = {"publisher": _PUBLISHER, "recorder": _RECORDER}
+"""Processes that say with a beat that they are at work."""
 
 ORPHAN_S = 10.0
 """Longest time for a process to end on its own when the one that started it is gone."""
@@ -127,6 +131,32 @@ class Control:
         self._values[_LOST], self._values[_SAMPLES] = lost, samples
 
     @property
+    def loop_pid(self) -> int:
+        """Process of the loop; 0 before it is at work, and when it has ended as it should."""
+        return 0 if self._values[_LOOP_DONE] else int(self._values[_LOOP_PID])
+
+    def loop_begins(self) -> None:
+        """Say that the loop is this process."""
+        self._values[_LOOP_PID] = os.getpid()
+
+    def loop_ends(self) -> None:
+        """Say that the loop ends as it should."""
+        self._values[_LOOP_DONE] = 1
+
+    def beat(self, reader: str) -> None:
+        """A reader (`READERS`) is at work."""
+        self._values[READERS[reader]] = time.monotonic_ns()
+
+    def beat_age_s(self, reader: str) -> float:
+        """Time since a reader's last beat, s; 0 before its first."""
+        beat = int(self._values[READERS[reader]])
+        return (time.monotonic_ns() - beat) * 1e-9 if beat else 0.0
+
+    def forget_beat(self, reader: str) -> None:
+        """A new reader of this name begins; that of the old one says nothing of it."""
+        self._values[READERS[reader]] = 0
+
+    @property
     def recorded(self) -> int:
         """Frames that the recorder has taken over."""
         return int(self._values[_RECORDED])
@@ -136,14 +166,17 @@ class Control:
         self._values[_RECORDED] = count
 
 
-def run_part(control: Control, nice: int, target: Callable[..., None], *args: Any) -> None:
+def run_part(control: Control, nice: int, aside: bool, target: Callable[..., None], *args: Any) -> None:
     """Target of every process of a run: calls ``target(*args)``, and has it stopped when the session is gone.
 
-    `nice` is how far it steps back behind the loop and the sensor where processors are few.
+    `nice` is how far it steps back behind the loop and the sensor where processors are few; `aside`: it leaves the loop's
+    processor to the loop.
 
     A session that is killed cannot order anything: without this a simulated head would go on sending for ever.
     """
     os.nice(nice)
+    if aside:
+        step_aside()
     parent = mp.parent_process()
     if parent is not None:
         Thread(target=_outlive, args=(control, parent.sentinel), daemon=True).start()

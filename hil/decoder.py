@@ -48,23 +48,38 @@ def _plain(value: Any) -> Any:
 
 
 def record_bus(
-    scenario: Scenario, path: Path, duration_s: float | None, cancelled: Callable[[], bool]
+    scenario: Scenario,
+    path: Path,
+    duration_s: float | None,
+    cancelled: Callable[[], bool],
+    tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Record frames of the scenario's bus until cancelled; what was recorded."""
+    """Record frames of the scenario's bus until cancelled; what was recorded. `tell` hears at once when the disk is full."""
     port = open_port(scenario.bus)
     batch = frames(1024)
-    count, chunks, began = 0, 0, time.monotonic()
+    count, chunks, problem, began = 0, 0, "", time.monotonic()
+    writer = _writer(path, scenario)
     try:
-        with _writer(path, scenario) as write:
+        with writer as write:
             while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
                 n = port.receive(batch, 0.05)
                 write(batch[:n])
                 count += n
                 chunks += int(is_chunk(batch[:n]).sum())
+                if writer.problem() != problem:
+                    problem = writer.problem()
+                    tell(f"{problem}: frames are lost to it" if problem else f"recording {path}: there is room again")
     finally:
         port.close()
     left_out = {"not_exported": chunks} if path.suffix != ".dhil" and chunks else {}
-    return {"file": str(path), "frames": count, **left_out, "seconds": time.monotonic() - began}
+    return {
+        "file": str(path),
+        "frames": count - writer.lost(),
+        "lost": writer.lost(),
+        "overflowed": getattr(port, "overflowed", 0),
+        **left_out,
+        "seconds": time.monotonic() - began,
+    }
 
 
 class _writer:
@@ -87,6 +102,12 @@ class _writer:
     def _write_foreign(self, batch: Any) -> None:
         for row in batch[~is_chunk(batch)]:  # serial bytes are no CAN frames
             self._foreign.on_message_received(to_message(row, "can0"))
+
+    def problem(self) -> str:
+        return self._own.problem if self._own is not None else ""
+
+    def lost(self) -> int:
+        return self._own.lost if self._own is not None else 0
 
     def __exit__(self, *_: object) -> None:
         if self._own is not None:

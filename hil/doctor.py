@@ -3,7 +3,6 @@
 import importlib.util
 import os
 import platform
-import resource
 import shutil
 import socket
 import sys
@@ -13,10 +12,17 @@ from pathlib import Path
 from typing import Literal
 
 from drivers import driver_names
+from drivers.can.interface import link
+from drivers.utc import PULSES
+from hil.realtime import refused
 from nav.errors import HilError
 
 ARPHRD_CAN = "280"
 WANTED_RMEM = 4 << 20
+LISTEN_S = 2.0
+"""How long a CAN interface is listened to: boards say some things once a second."""
+TROUBLED = ("ERROR-WARNING", "ERROR-PASSIVE", "BUS-OFF")
+"""States of a CAN controller that hears errors."""
 Verdict = Literal["ok", "lack", "info"]
 
 
@@ -35,8 +41,8 @@ class Finding:
 
 
 def examine(*, probe: bool = False) -> list[Finding]:
-    """All findings; `probe`: also who speaks on the serial ports, which takes seconds and opens them."""
-    return [*_python(), *_can(), *_real_time(), *_network(), *_serial(probe=probe), *_extras()]
+    """All findings; `probe`: also who speaks on CAN interfaces and serial ports, which takes seconds and opens them."""
+    return [*_python(), *_can(probe=probe), *_real_time(), *_network(), *_serial(probe=probe), *_extras()]
 
 
 def _python() -> Iterator[Finding]:
@@ -58,7 +64,7 @@ def can_interfaces() -> list[str]:
     return found
 
 
-def _can() -> Iterator[Finding]:
+def _can(*, probe: bool) -> Iterator[Finding]:
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
         kernel = True
@@ -80,35 +86,63 @@ def _can() -> Iterator[Finding]:
         "" if interfaces else "sudo sh -c 'modprobe vcan; ip link add vcan0 type vcan && ip link set vcan0 mtu 72 up'",
     )
     for name in interfaces:
-        flags = int((Path("/sys/class/net") / name / "flags").read_text(), 16)
-        mtu = (Path("/sys/class/net") / name / "mtu").read_text().strip()
-        state = f"{'up' if flags & 1 else 'down'}, mtu {mtu}"
-        good = bool(flags & 1) and mtu == "72"
-        mend = f"sudo ip link set {name} down; sudo ip link set {name} mtu 72 up"
-        yield Finding(name, "ok" if good else "lack", state, "" if good else mend)
+        yield _interface(name)
+        if probe:
+            yield _board_on_can(name)
     if not kernel:
         uml = shutil.which("linux.uml")
         mend = "" if uml else "sudo apt-get install user-mode-linux (make vcan does it)"
         yield Finding("user-mode Linux (SocketCAN for tests)", "ok" if uml else "lack", uml or "not installed", mend)
 
 
+def _interface(name: str) -> Finding:
+    """State of a CAN interface: of the network's side, and of its controller where it has one."""
+    flags = int((Path("/sys/class/net") / name / "flags").read_text(), 16)
+    mtu = (Path("/sys/class/net") / name / "mtu").read_text().strip()
+    known = link(name)
+    parts = ["up" if flags & 1 else "down", f"mtu {mtu}", known.state]
+    parts += [f"{rate} bit/s" for rate in (known.bitrate, known.data_bitrate) if rate]
+    good = bool(flags & 1) and mtu == "72"
+    mend = "" if good else f"sudo ip link set {name} down; sudo ip link set {name} mtu 72 up"
+    if known.state in TROUBLED:
+        good, mend = (
+            False,
+            f"mend wiring, termination or bit rate; then: sudo ip link set {name} down; sudo ip link set {name} up",
+        )
+    return Finding(name, "ok" if good else "lack", ", ".join(part for part in parts if part), mend)
+
+
+def _board_on_can(name: str) -> Finding:
+    """Who speaks on an interface."""
+    from hil.monitor import Monitor
+    from hil.watch import watch_bus
+
+    url = f"socketcan:{name}"
+    try:
+        report = watch_bus(Monitor(None), url, LISTEN_S, lambda: False, quiet=True)
+    except HilError as error:
+        return Finding(name, "lack", str(error))
+    if report["driver"] is None:
+        return Finding(name, "info", f"no board that is known; {report['frames']} frames in {LISTEN_S:g} s")
+    return Finding(name, "ok", f"hil run --imu {report['driver']} --bus {url}")
+
+
 def _real_time() -> Iterator[Finding]:
-    soft, hard = resource.getrlimit(resource.RLIMIT_RTPRIO)
-    good = os.geteuid() == 0 or hard > 0
-    yield Finding(
-        "real-time priority",
-        "ok" if good else "lack",
-        f"rtprio limit {soft}..{hard}{', root' if os.geteuid() == 0 else ''}",
-        "" if good else "add '@realtime - rtprio 90' to /etc/security/limits.d and join that group",
+    lacking = refused()
+    found = (
+        "; ".join(lack.partition(":")[0] for lack in lacking) or "priority, locked memory and a processor are granted"
     )
-    memlock = resource.getrlimit(resource.RLIMIT_MEMLOCK)[1]
-    text = "unlimited" if memlock == resource.RLIM_INFINITY else f"{memlock >> 20} MiB"
-    yield Finding("locked memory", "info", text)
+    mend = "" if not lacking else lacking[0].partition(": ")[2]
+    yield Finding("hil run --realtime", "lack" if lacking else "ok", found, mend)
+    kernel = Path("/sys/kernel/realtime")
+    text = "PREEMPT_RT" if kernel.is_file() and kernel.read_text().strip() == "1" else "not PREEMPT_RT"
+    yield Finding("kernel", "info", f"{platform.release()}, {text}")
     clock = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
     source = clock.read_text().strip() if clock.is_file() else "unknown"
     slow = source in {"hpet", "acpi_pm", "jiffies"}
     mend = "choose tsc (kernel parameter clocksource=tsc): every look at the clock costs microseconds" if slow else ""
     yield Finding("clock source", "lack" if slow else "ok", source, mend)
+    yield Finding("pulse lines (PPS)", "info", ", ".join(sorted(line.name for line in PULSES.glob("pps*"))) or "none")
     yield Finding("processors", "info", f"{len(os.sched_getaffinity(0))} usable of {os.cpu_count()}")
 
 
@@ -142,7 +176,7 @@ def _serial(*, probe: bool) -> Iterator[Finding]:
 
 
 def _board(device: str) -> Finding:
-    from drivers.serial.probe import probe
+    from drivers.serial.probe import options_of, probe
 
     try:
         heard = probe(device)
@@ -150,11 +184,16 @@ def _board(device: str) -> Finding:
         return Finding(device, "lack", str(error))
     if heard is None:
         return Finding(device, "info", "no board that is known, at any usual rate")
-    return Finding(device, "ok", f"hil run --imu {heard.driver} --bus serial:{device}:{heard.baud}")
+    return Finding(device, "ok", f"hil run {options_of(heard, device)}")
 
 
 def _extras() -> Iterator[Finding]:
-    for module, what, extra in (("pyulog", "PX4 logs", "logs"), ("matplotlib", "plots", "plot")):
+    for module, what, extra in (
+        ("pyulog", "PX4 logs", "logs"),
+        ("matplotlib", "plots", "plot"),
+        ("pyarrow", "Parquet tables", "parquet"),
+        ("mcap", "MCAP files", "mcap"),
+    ):
         there = importlib.util.find_spec(module) is not None
         mend = "" if there else f"pip install 'dtg-hil[{extra}]'"
         yield Finding(what, "ok" if there else "lack", module if there else f"{module} is not installed", mend)

@@ -1,15 +1,16 @@
 """What goes over the MAVLink links, in shared memory: written by the publisher, read by whoever shows it."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from drivers.mavlink.endpoint import Endpoint
+from drivers.mavlink.hub import Tally
 from drivers.mavlink.messages import KINDS
+from drivers.mavlink.options import LinkOptions
 from hil.ring import Shared
 
-_COLUMNS = ("sent", "received", "bad", "dropped")
+_COLUMNS = ("sent", "received", "refused", "bad", "dropped", "lost")
 
 
 class LinkStats:
@@ -17,27 +18,30 @@ class LinkStats:
 
     Parameters
     ----------
-    urls : tuple of str
-        The links.
+    links : iterable of LinkOptions
+        The links; those to the same URL are counted together, and so are the clients of a server.
     """
 
-    def __init__(self, urls: tuple[str, ...], shared: Shared | None = None) -> None:
-        self.urls = urls
+    def __init__(self, links: Iterable[LinkOptions], shared: Shared | None = None) -> None:
+        self._options = tuple(links)
+        self.urls = urls = tuple(dict.fromkeys(one.url for one in self._options))
         self._shared = shared or Shared(8 * max(1, len(urls) * (len(_COLUMNS) + len(KINDS))))
         table = np.frombuffer(self._shared.memory, np.int64, len(urls) * (len(_COLUMNS) + len(KINDS)))
         self._table = table.reshape(len(urls), len(_COLUMNS) + len(KINDS))
 
     def __reduce__(self) -> Any:
-        return LinkStats, (self.urls, self._shared)
+        return LinkStats, (self._options, self._shared)
 
-    def tell(self, endpoints: Sequence[Endpoint]) -> None:
-        """Say what the endpoints have counted, in the order of the links."""
-        for row, one in zip(self._table, endpoints, strict=True):
-            row[: len(_COLUMNS)] = one.sent.total(), one.received.total(), one.bad_data, one.dropped
-            row[len(_COLUMNS) :] = [one.sent[name] for name in KINDS]
+    def tell(self, tallies: Mapping[str, Tally]) -> None:
+        """Say what the links have counted, by URL."""
+        for row, url in zip(self._table, self.urls, strict=True):
+            one = tallies[url]
+            named = (sum(one[key].values()) for key in ("sent", "received", "refused"))
+            row[: len(_COLUMNS)] = *named, one["bad_data"], one["dropped"], one["lost"]
+            row[len(_COLUMNS) :] = [one["sent"].get(name, 0) for name in KINDS]
 
     def links(self) -> list[dict[str, int | str]]:
-        """url, sent, received, bad, dropped of each link."""
+        """url, sent, received, refused, bad, dropped, lost of each link."""
         return [
             {"url": url} | dict(zip(_COLUMNS, row[: len(_COLUMNS)].tolist(), strict=True))
             for url, row in zip(self.urls, self._table, strict=True)

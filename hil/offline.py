@@ -1,12 +1,13 @@
 """`hil navigate`: strapdown navigation of logged increments, from file to file, as docs/cli.md lays out."""
 
 import math
-import tomllib
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from hil.offline_filter import FilterConfig, read_filter
+from hil.toml import read_toml
 from nav.errors import HilError
 from nav.increments import FloatArray
 from nav.rotation import euler_from_quaternion, quaternion_from_euler
@@ -27,19 +28,14 @@ def read_init(path: Path) -> tuple[dict[str, float], FilterConfig | None]:
     HilError
         Missing file, not TOML, a key that is missing, unknown or of a wrong value.
     """
-    try:
-        table = tomllib.loads(path.read_text())
-    except OSError as error:
-        raise HilError(f"{path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise HilError(f"{path}: not TOML: {error}") from error
+    table = read_toml(path, str(path))
     for name in table:
         if name not in (*NAV_HEADER, "filter"):
             raise HilError(f"{path}: unknown key {name!r}; expected {', '.join(NAV_HEADER)} and [filter]")
     start = {}
     for name in NAV_HEADER:
         value = table.get(name)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
             raise HilError(f"{path}: key {name} = {value!r}: expected a number")
         start[name] = float(value)
     if abs(start["lat_deg"]) > 90 or abs(start["pitch_deg"]) > 90:

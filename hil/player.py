@@ -3,7 +3,7 @@
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ from drivers.can.aiding import AidingEncoder, merge
 from drivers.can.bus import open_port
 from drivers.can.dtg_head_emulator import REPLAY, HeadEncoder
 from drivers.can.frames import FrameArray, frames
-from drivers.logs.dataflash import read_dataflash
 from drivers.logs.imu_log import ImuLog
-from drivers.logs.ulog import read_ulog
 from hil.bridge import LoopOrder
 from hil.control import Control
-from hil.geoid import undulation
+from hil.flight_log import is_flight_log, read_flight_log
 from hil.pacing import Pacer
 from hil.reference import Reference, interpolate_attitude
 from hil.scenario import Scenario, load, validated
@@ -40,11 +38,6 @@ HAND = {"acceleration_ms2": 0.3, "speed_ms": 0.3, "place_m": 1.0}
 """What a board without a receiver does, on a desk or in a hand."""
 SLOW_S = 1.0
 CHUNK = 256
-_IMU_LOGS: dict[str, Callable[[Path], ImuLog]] = {
-    ".ulg": read_ulog,
-    ".bin": lambda path: read_dataflash(path, undulation),
-}
-"""Readers of flight logs by file ending."""
 
 
 def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced: bool) -> tuple[LoopOrder, bool]:
@@ -59,8 +52,8 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
         The file cannot be read or is of no kind that is known.
     """
     suffix = path.suffix.lower()
-    if is_imu_log(path):
-        log = _IMU_LOGS[suffix](path)
+    if is_flight_log(path):
+        log = read_flight_log(path)
         scenario = load(scenario_file) if scenario_file else _board_scenario(path, log)
         reference = Reference(
             time=np.asarray(log.attitude_us * 1e-6, float),
@@ -166,21 +159,10 @@ def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _:
         answer.close()
 
 
-def is_imu_log(path: Path) -> bool:
-    """Whether `path` is a flight log, which holds no frames.
-
-    Raises
-    ------
-    HilError
-        The file cannot be read.
-    """
-    return path.suffix.lower() in _IMU_LOGS and not is_own(path)
-
-
 def timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]]:
     """(seconds from the start, frames) of a recording; events are left out."""
-    if is_imu_log(path):
-        yield from _head_frames(_IMU_LOGS[path.suffix.lower()](path), 1 if one_by_one else CHUNK)
+    if is_flight_log(path):
+        yield from _head_frames(read_flight_log(path), 1 if one_by_one else CHUNK)
         return
     source = FileSource(path, paced=False)
     batch = frames(CHUNK)

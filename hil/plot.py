@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.clock_log import ClockLog
 from hil.reference import Reference
 from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
@@ -88,6 +89,36 @@ def plot_deviations(path: Path, fits: Mapping[str, AllanFit], title: str) -> Non
         axes.grid(alpha=0.3, which="both")
     upper.set_title(f"Allan deviation, {title}")
     lower.set_xlabel("tau, s")
+    _save(figure, path)
+
+
+def plot_clock(path: Path, log: ClockLog, title: str) -> None:
+    """What each arrival lies above the line of the clock's fit and the line's bound, and the drift, over device time.
+
+    Raises
+    ------
+    HilError
+        The file cannot be written.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    upper.plot(log.time, 1e6 * log.age, ",", color="C0", rasterized=True, label="arrival over the line")
+    known = np.isfinite(log.bound)
+    upper.plot(log.time[known], 1e6 * log.bound[known], color="C1", linewidth=1.0, label="bound of the line")
+    upper.set_yscale("symlog", linthresh=1.0)
+    upper.set_ylim(bottom=0.0)
+    upper.set_ylabel("us")
+    upper.set_title(title)
+    lower.plot(log.time[known], 1e6 * log.drift[known], color="C0", linewidth=1.0)
+    lower.set_ylabel("drift of the device, ppm")
+    lower.set_xlabel("device time, s")
+    for axes in (upper, lower):
+        for number, step in enumerate(log.steps):
+            axes.axvline(step.time_s, color="C3", linestyle="--", label="" if number else "step")
+        axes.grid(alpha=0.3)
+    upper.legend(fontsize="small")
     _save(figure, path)
 
 

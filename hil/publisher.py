@@ -5,29 +5,34 @@ goes out has just been computed. The loop that computes never waits for it.
 """
 
 import math
+import os
 import selectors
 import signal
 import time
-from collections import Counter
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.mavlink.endpoint import Endpoint
+from drivers.mavlink.hub import Hub, total
 from drivers.mavlink.intake import Intake
-from drivers.mavlink.link import open_link
+from drivers.mavlink.options import LinkOptions, parse_options
+from drivers.mavlink.signing import Signer, read_key
 from drivers.mavlink.station import Identity, Station
+from drivers.mavlink.store import Store, state_folder
+from hil.clock import clock_reading
 from hil.control import Control
 from hil.geoid import undulation
 from hil.link_stats import LinkStats
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
+from hil.stats import Stats
+from nav.aiding import AIDING
 from nav.errors import HilError
 from nav.state import NAV_STATE
 
@@ -37,6 +42,7 @@ _READ_S = 0.1
 """A solution is read at least this often, for the status."""
 _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
+LOOP_DIED = "the navigation loop died: no solutions any more"
 _TELL_S = 0.2
 """What went over the links is told so often."""
 
@@ -59,6 +65,10 @@ class Taps:
         Of `FRAME`: takes measurements from the network to the loop.
     early : bool
         They serve the alignment as well.
+    stats : Stats, optional
+        What the loop's clock says is published.
+    fixes : Ring, optional
+        Of `AIDING`: what receivers have measured.
     links : LinkStats, optional
         Told a few times a second what went over the links.
     """
@@ -69,6 +79,8 @@ class Taps:
     control: Control
     aiding: Ring | None = None
     early: bool = False
+    stats: Stats | None = None
+    fixes: Ring | None = None
     links: LinkStats | None = None
 
 
@@ -84,9 +96,9 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
     stop : Wake
         Ends the publisher.
     report : Connection
-        Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``bad_data``, ``dropped``, ``links`` (the
-        same for each URL), ``latency_us`` (arrival of the sample to the end of sending, `None` without one) and, where
-        measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
+        Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``refused`` (by reason), ``bad_data``,
+        ``dropped``, ``lost``, ``links`` (the same for each URL), ``latency_us`` (arrival of the sample to its ATTITUDE on a
+        link, `None` without one) and, where measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
         ``failed``, a text, when a link could not be opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
@@ -95,17 +107,17 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
             identity = Identity(config.system_id, config.component_id, config.vehicle)
             intake = _intake(config, taps)
             order = partial(_obey, control=taps.control)
-            station = Station(identity, config.rates_hz, undulation, order, intake)
-            endpoints = []
-            for url in config.links:
-                link = open_link(url)
-                stack.callback(link.close)
-                endpoints.append(Endpoint(station, link))
+            station = Station(identity, config.rates_hz, undulation, order, intake, _parameter_store(config))
+            signer = _signer(config)
+            if signer is not None:
+                stack.callback(signer.close)
+            hub = Hub(station, link_options(config), signer)
+            stack.callback(hub.close)
         except HilError as error:
             _tell(report, {"failed": str(error)})
             return
         _warm_up(station)
-        publisher = _Publisher(taps, station, endpoints)
+        publisher = _Publisher(taps, station, hub)
         stack.callback(publisher.close)
         publisher.run(stop, report)
         _tell(report, publisher.counters())
@@ -114,11 +126,14 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
 class _Publisher:
     """The state of one run."""
 
-    def __init__(self, taps: Taps, station: Station, endpoints: Sequence[Endpoint]) -> None:
+    def __init__(self, taps: Taps, station: Station, hub: Hub) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
-        self._station, self._endpoints = station, endpoints
+        self._stats = taps.stats
         self._links, self._told_s = taps.links, -math.inf
+        self._station, self._hub = station, hub
+        station.on_attitude = self._attitude_sent
         self._row = np.zeros(1, NAV_STATE)
+        self._fixes, self._fix, self._fixed = taps.fixes, np.zeros(1, AIDING), 0
         self._events, self._event_number = taps.events, 0
         self._notes = np.zeros(16, taps.events.dtype)
         self._seen = 0
@@ -128,11 +143,14 @@ class _Publisher:
         self._aged = 0
         self._selector = selectors.DefaultSelector()
         self._watching = False
-        for endpoint in endpoints:
-            self._selector.register(endpoint.link, selectors.EVENT_READ)
+        self._loop: int | None = None
+        """Descriptor of the loop's process; -1: it had ended before we looked."""
+        self._selector.register(hub, selectors.EVENT_READ)
 
     def close(self) -> None:
         self._selector.close()
+        if self._loop not in {None, -1}:
+            os.close(self._loop)
 
     def run(self, stop: Wake, report: Connection) -> None:
         self._selector.register(stop, selectors.EVENT_READ)
@@ -140,10 +158,33 @@ class _Publisher:
         ends = (stop, report)
         next_s = time.monotonic()
         while True:
+            self._control.beat("publisher")
+            if self._loop is None and (pid := self._control.loop_pid):
+                self._watch_loop(pid)
             ready = [key.fileobj for key, _ in self._selector.select(max(0.0, next_s - time.monotonic()))]
+            if self._loop is not None and self._loop in ready:
+                self._selector.unregister(self._loop)
+                if self._control.loop_pid:
+                    self._say_died()
             if any(one in ends for one in ready):
                 return
             next_s = self._step(self._wake in ready)
+
+    def _watch_loop(self, pid: int) -> None:
+        try:
+            self._loop = os.pidfd_open(pid)
+        except ProcessLookupError:
+            self._loop = -1
+            if self._control.loop_pid:
+                self._say_died()
+        else:
+            self._selector.register(self._loop, selectors.EVENT_READ)
+
+    def _say_died(self) -> None:
+        self._silent = True
+        self._station.silence()
+        for endpoint in self._hub.endpoints:
+            endpoint.say("error", LOOP_DIED)
 
     def _step(self, called: bool) -> float:
         """Do what is due now; returns when to come again."""
@@ -155,7 +196,7 @@ class _Publisher:
         next_s = self._poll(now_s)
         if self._links is not None and now_s - self._told_s > _TELL_S:
             self._told_s = now_s
-            self._links.tell(self._endpoints)
+            self._links.tell(self._hub.tallies())
         if self._hungry() and self._ring.count - self._seen == 1:  # a slow sensor: do not wait for its next solution
             self._read(now_s)
             next_s = self._poll(now_s)
@@ -163,15 +204,14 @@ class _Publisher:
         return next_s
 
     def _hungry(self) -> bool:
-        return any(endpoint.waits for endpoint in self._endpoints)
+        return any(endpoint.waits for endpoint in self._hub.endpoints)
 
     def _poll(self, now_s: float) -> float:
-        before = sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints)
-        next_s = min((endpoint.poll(now_s) for endpoint in self._endpoints), default=now_s + _SILENCE_S)
-        if sum(endpoint.sent["ATTITUDE"] for endpoint in self._endpoints) != before:
-            self._ages_ns[self._aged % _AGES] = time.time_ns() - self._row["arrival_ns"][0]
-            self._aged += 1
-        return next_s
+        return self._hub.poll(now_s)
+
+    def _attitude_sent(self) -> None:
+        self._ages_ns[self._aged % _AGES] = time.time_ns() - self._row["arrival_ns"][0]
+        self._aged += 1
 
     def _read(self, now_s: float) -> None:
         count = self._ring.count
@@ -183,6 +223,11 @@ class _Publisher:
             self._silent = True
             self._station.silence()
         self._station.set_loss(self._control.lost, self._control.samples)
+        if self._stats is not None:
+            self._station.set_clock(clock_reading(self._stats))
+        if self._fixes is not None and self._fixes.count != self._fixed and self._fixes.latest(self._fix):
+            self._fixed = self._fixes.count
+            self._station.set_fix(self._fix[0])
         copied, first = self._events.pull(self._notes, self._event_number)
         self._event_number = first + copied
         for note in self._notes[:copied][self._notes["station"][:copied]]:
@@ -202,24 +247,11 @@ class _Publisher:
 
     def counters(self) -> dict[str, Any]:
         """What was sent and received, for the report."""
-        links = {
-            endpoint.link.url: {
-                "sent": dict(endpoint.sent),
-                "received": dict(endpoint.received),
-                "bad_data": endpoint.bad_data,
-                "dropped": endpoint.dropped,
-            }
-            for endpoint in self._endpoints
-        }
-        total: dict[str, Any] = {
-            key: dict(sum((getattr(endpoint, key) for endpoint in self._endpoints), Counter[str]()))
-            for key in ("sent", "received")
-        }
-        for key in ("bad_data", "dropped"):
-            total[key] = sum(getattr(endpoint, key) for endpoint in self._endpoints)
+        links = self._hub.tallies()
+        totals = total(links.values())
         if (intake := self._station.intake) is not None:
-            total["aiding"] = {"taken": dict(intake.taken), "refused": dict(intake.refused)}
-        return total | {"links": links, "latency_us": self._latency()}
+            totals["aiding"] = {"taken": dict(intake.taken), "refused": dict(intake.refused)}
+        return totals | {"links": links, "latency_us": self._latency()}
 
     def _latency(self) -> dict[str, float] | None:
         ages_us = self._ages_ns[: min(self._aged, _AGES)] / 1e3
@@ -232,7 +264,7 @@ class _Publisher:
 def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
     """What is taken from the network, as frames of a sender of its own to the loop."""
     ring = taps.aiding
-    if ring is None or not config.aiding:
+    if ring is None or not (config.aiding or config.operator):
         return None
     from drivers.can.aiding import AidingEncoder
 
@@ -243,7 +275,33 @@ def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
         batch["time_ns"] = time.time_ns()
         ring.push(batch)
 
-    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, early=taps.early)
+    how = {"early": taps.early, "measurements": config.aiding}
+    return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, **how)
+
+
+def link_options(config: MavlinkConfig) -> list[LinkOptions]:
+    """The links of a configuration.
+
+    Raises
+    ------
+    HilError
+        An unknown option of a link, or a wrong value.
+    """
+    return [parse_options(one) if isinstance(one, str) else LinkOptions(**one.model_dump()) for one in config.links]
+
+
+def _signer(config: MavlinkConfig) -> Signer | None:
+    """What signs; its times outlive the run, whatever the key."""
+    if not config.signing_key:
+        return None
+    store = Store(state_folder() / "mavlink-signing.json")
+    return Signer(read_key(Path(config.signing_key).expanduser()), store, config.accept_unsigned)
+
+
+def _parameter_store(config: MavlinkConfig) -> Store | None:
+    if not config.keep_parameters:
+        return None
+    return Store(state_folder() / f"parameters-{config.system_id}-{config.component_id}.json")
 
 
 def _obey(command: str, control: Control) -> None:

@@ -124,6 +124,7 @@ class StartBridge(Protocol):
         simulate_head: bool = True,
         paced: bool = True,
         record: Path | None = None,
+        realtime: bool = False,
         **changes: Any,
     ) -> Bridge: ...
 
@@ -142,6 +143,8 @@ def hil_bridge() -> Iterator[StartBridge]:
         Real time; False: simulated time, as fast as it goes and lossless.
     record : Path, optional
         Recording to write.
+    realtime : bool
+        As ``--realtime``.
     **changes
         Laid over the scenario, as ``duration_s=5`` or ``head={"rate_hz": 100}``; `bus` and ``mavlink={"links": ...}``
         replace the private ones.
@@ -159,6 +162,7 @@ def hil_bridge() -> Iterator[StartBridge]:
             simulate_head: bool = True,
             paced: bool = True,
             record: Path | None = None,
+            realtime: bool = False,
             **changes: Any,
         ) -> Bridge:
             from hil.bridge import LoopOrder
@@ -171,7 +175,7 @@ def hil_bridge() -> Iterator[StartBridge]:
             if "links" not in changes.get("mavlink", {}):
                 port = _free_udp_port()
                 changes["mavlink"] = {**changes.get("mavlink", {}), "links": (f"udpout:127.0.0.1:{port}",)}
-            order = LoopOrder(chosen.with_changes(**changes), paced=paced)
+            order = LoopOrder(chosen.with_changes(**changes), paced=paced, realtime=realtime)
             session = Session(order, feeder=simulated_head(order) if simulate_head else None, record=record)
             bridge = Bridge(session.__enter__(), port)
             stack.callback(_report, bridge)

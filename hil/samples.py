@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from drivers import make_driver
+from drivers.logs.imu_log import ImuLog
+from hil.flight_log import is_flight_log, read_flight_log
 from hil.offline import IMU_HEADER
 from hil.source import FileSource, is_own, scenario_table
 from hil.tables import TABLES, read_table
@@ -50,7 +52,8 @@ def read_samples(path: Path, driver_name: str | None = None) -> Samples:
     Parameters
     ----------
     path : Path
-        A recording of frames, or ``.csv``, ``.npz``, ``.parquet`` with the header of `hil navigate`.
+        A recording of frames, a flight log (``.ulg``, ``.bin``), or a table (``.csv``, ``.npz``, ``.parquet``) with the header of
+        `hil navigate`.
     driver_name : str, optional
         Of the board; left out: that of the scenario in our own recording.
 
@@ -59,17 +62,19 @@ def read_samples(path: Path, driver_name: str | None = None) -> Samples:
     HilError
         The file cannot be read, holds no samples, or needs a driver's name.
     """
+    if is_flight_log(path):
+        return Samples(_columns(log_increments(read_flight_log(path))), "")
     if path.suffix.lower() in TABLES and not is_own(path):
         table = read_table(path, IMU_HEADER)
         step = np.diff(table[:, 0], prepend=2.0 * table[0, 0] - table[min(1, len(table) - 1), 0])
         order = {"sequence": np.arange(len(table), dtype=float), "validity": np.zeros(len(table))}
         named = dict(zip(IMU_HEADER, table.T, strict=True))
         return Samples({"time_s": named.pop("time_s"), "step_s": step, **order, **named}, "")
-    driver, source = make_driver(driver_name or _driver_of(path)), FileSource(path, paced=False)
+    driver, source = make_driver(driver_name or driver_of(path)), FileSource(path, paced=False)
     parts = [_columns(samples) for batch in source.batches(1024) if len(samples := driver.decode(batch))]
     if not parts:
         raise HilError(
-            f"{path}: no samples of {driver_name or _driver_of(path)} in it: give the board's driver with --imu"
+            f"{path}: no samples of {driver_name or driver_of(path)} in it: give the board's driver with --imu"
         )
     return Samples({name: np.concatenate([part[name] for part in parts]) for name in parts[0]}, source.problem())
 
@@ -115,7 +120,22 @@ def coefficients(axis: str, fit: AllanFit) -> dict[str, float]:
     }
 
 
-def _driver_of(path: Path) -> str:
+def log_increments(log: ImuLog) -> ImuIncrements:
+    """The samples of a flight log."""
+    step = np.asarray(log.step_us * 1e-6, np.float64)
+    turn, push = log.rate * step[:, None], log.force * step[:, None]
+    time = np.asarray(1e-6 * log.time_us, np.float64)
+    return ImuIncrements(time, step, turn, push, np.zeros(len(step), np.int64), log.counter)
+
+
+def driver_of(path: Path) -> str:
+    """Driver of the board in our own recording.
+
+    Raises
+    ------
+    HilError
+        It is a recording of another kind, which does not say it.
+    """
     if not is_own(path):
         raise HilError(f"{path}: it does not say what board is in it: give the driver with --imu")
     return str((scenario_table(path) or {}).get("driver", "dtg-head"))

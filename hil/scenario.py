@@ -5,15 +5,17 @@ laid over the file with `Scenario.with_changes`.
 """
 
 import json
-import tomllib
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hil.toml import parse_toml
+from hil.wire_config import WireFault
+from nav.alignment.axes import matrix, rotation
 from nav.errors import HilError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -21,6 +23,7 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
 PositiveVector = tuple[Positive, Positive, Positive]
+AxisName = Literal["x", "y", "z", "-x", "-y", "-z"]
 
 
 class _Model(BaseModel):
@@ -114,6 +117,10 @@ class HeadConfig(_Model):
     serial: Annotated[int, Field(ge=0, lt=2**32)] = 1
     mounting_deg: Vector = (0.0, 0.0, 0.0)
     """Heading, pitch, roll of the head's axes relative to the body."""
+    axes: tuple[AxisName, AxisName, AxisName] | None = None
+    """The same where they lie along those of the body: the head's axes that point forward, right and down."""
+    mounting: tuple[Vector, Vector, Vector] | None = None
+    """The same as a matrix: takes vectors in the head's axes to the body's."""
     lever_arm_m: Vector = (0.0, 0.0, 0.0)
     """Place of the head in the body, forward-right-down of the navigated point."""
     instruments: Literal["ideal", "dtg"] = "ideal"
@@ -144,6 +151,22 @@ class HeadConfig(_Model):
             beside = folder / value
             return read(beside if beside.is_file() else Path(value)).as_table()
         return validated(value, "in the scenario").as_table()
+
+    @field_validator("axes", "mounting")
+    @classmethod
+    def _turns(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is not None:
+            try:
+                matrix(value) if info.field_name == "axes" else rotation(value)
+            except HilError as error:
+                raise ValueError(str(error)) from error
+        return value
+
+    @model_validator(mode="after")
+    def _mounted_once(self) -> Self:
+        if any(self.mounting_deg) + (self.axes is not None) + (self.mounting is not None) > 1:
+            raise ValueError("mounting_deg, axes and mounting say the same: give one of them")
+        return self
 
     @field_validator("rate_hz")
     @classmethod
@@ -251,6 +274,32 @@ class AidingConfig(_Model):
     """Of the World Magnetic Model."""
 
 
+class ReceiverConfig(_Model):
+    """A real receiver of satellite navigation at a port of its own."""
+
+    port: str
+    protocol: Literal["auto", "ubx", "nmea"] = "auto"
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+    """Place of the antenna in the body, forward-right-down of the navigated point."""
+    delay_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """How old the fastest fix is when it arrives."""
+    range_error_m: Positive = 4.0
+    """NMEA without GST: the position errs by this times the dilution of precision, one sigma."""
+    speed_error_ms: Positive = 0.3
+    """NMEA: one sigma of the velocity."""
+    heading_error_deg: Positive = 1.0
+    """NMEA: one sigma of a heading."""
+    heading_offset_deg: Finite = 0.0
+    """Heading of the line between two antennas less that of the body."""
+
+    @field_validator("port")
+    @classmethod
+    def _serial(cls, value: str) -> str:
+        if not value.startswith("serial:"):
+            raise ValueError("a receiver is at a serial port: serial:/dev/ttyACM0:115200")
+        return value
+
+
 class StartConfig(_Model):
     """A known start; what is left out comes from the alignment or from the motion's truth."""
 
@@ -349,10 +398,26 @@ class NavigationConfig(_Model):
         return self
 
 
+class LinkConfig(_Model):
+    """A MAVLink link with options of its own."""
+
+    url: str
+    rates_hz: Mapping[str, NotNegative] = Field(default_factory=dict)
+    """Message name to rate, over those of all links."""
+    only: tuple[str, ...] = ()
+    """Messages that may go out here; none named: all."""
+    hear: bool = True
+    """False: what comes in is neither answered nor obeyed."""
+    sign: bool = True
+    """False: without signatures where there is a key."""
+    tlog: str = ""
+    """File for what is sent and received."""
+
+
 class MavlinkConfig(_Model):
     """Where and how often the solution goes out as MAVLink."""
 
-    links: tuple[str, ...] = ("udpout:127.0.0.1:14550",)
+    links: tuple[str | LinkConfig, ...] = ("udpout:127.0.0.1:14550",)
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     component_id: Annotated[int, Field(ge=1, le=255)] = 1
     vehicle: Literal["fixed-wing", "quadrotor", "helicopter", "ground-rover", "surface-boat", "generic"] = "fixed-wing"
@@ -360,12 +425,20 @@ class MavlinkConfig(_Model):
     """Message name to rate, over the built-in rates; 0 switches a message off."""
     aiding: bool = False
     """Take measurements from the network."""
+    operator: bool = False
+    """Take position and heading from a person at a ground station."""
     aiding_from: tuple[Annotated[int, Field(ge=1, le=255)], ...] = (255,)
-    """Systems that may send them."""
+    """Systems that may send measurements, position, heading and home."""
     aiding_delay_s: Annotated[float, Field(ge=0, le=1)] = 0.0
     """How old they are when they come."""
     master: tuple[Annotated[int, Field(ge=1, le=255)], Annotated[int, Field(ge=1, le=255)]] | None = None
     """System and component of another inertial system, whose position, velocity and attitude are taken."""
+    signing_key: str = ""
+    """File of the key; empty: nothing is signed."""
+    accept_unsigned: tuple[str, ...] = ()
+    """Messages that are taken without a signature."""
+    keep_parameters: bool = True
+    """What a ground station sets holds in later runs."""
 
 
 class Scenario(_Model):
@@ -381,6 +454,9 @@ class Scenario(_Model):
     motion: MotionConfig = MotionConfig()
     head: HeadConfig = HeadConfig()
     aiding: AidingConfig = AidingConfig()
+    wire: tuple[WireFault, ...] = ()
+    """What becomes of the simulated head's frames on their way."""
+    receiver: Annotated[tuple[ReceiverConfig, ...], Field(max_length=16)] = ()
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
 
@@ -399,12 +475,20 @@ class Scenario(_Model):
         """A copy with `changes` laid over it (nested dictionaries reach nested keys), validated anew."""
         return validated(_merged(self.model_dump(mode="json"), changes), "command line")
 
+    def with_receivers(self, ports: Sequence[str]) -> "Scenario":
+        """A copy with receivers at `ports`, which aid the navigator; the first ones are those of the scenario, at other ports."""
+        known = [one.model_dump(mode="json") for one in self.receiver]
+        receivers = [{**dict(enumerate(known)).get(k, {}), "port": port} for k, port in enumerate(ports)]
+        return self.with_changes(receiver=receivers, navigation={"aided": True})
+
     def world_id(self) -> int:
         """A 32-bit fingerprint of what the simulated head does: motion, head and seed; never 0.
 
-        The simulated head announces it, so that a bridge elsewhere knows whether its own truth applies.
+        The simulated head announces it, so that a bridge elsewhere knows whether its own truth applies. Keys at their default
+        do not count, so that a new key changes no fingerprint of a recording.
         """
-        world = self.model_dump(mode="json", include={"motion", "head", "seed"}, exclude={"head": {"calibration"}})
+        kept = {"motion", "head", "seed"}
+        world = self.model_dump(mode="json", include=kept, exclude={"head": {"calibration"}}, exclude_defaults=True)
         return zlib.crc32(json.dumps(world, sort_keys=True).encode()) or 1
 
 
@@ -441,11 +525,7 @@ def parse(text: str, source: str, folder: Path = Path()) -> Scenario:
     HilError
         As for `load`.
     """
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise HilError(f"scenario {source}: not TOML: {error}") from error
-    return validated(table, source, folder)
+    return validated(parse_toml(text, f"scenario {source}"), source, folder)
 
 
 def built_in_names() -> list[str]:

@@ -1,6 +1,7 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
     feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, dashboard, this process
+                                receivers --rings--^
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
 """
@@ -10,7 +11,7 @@ import multiprocessing as mp
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import TracebackType
@@ -18,14 +19,18 @@ from typing import Any
 
 import numpy as np
 
+from drivers.utc import PulseClock
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
-from hil.control import run_part
+from hil.clock import clock_summary
+from hil.control import READERS, run_part
 from hil.dashboard import Sources, Window, recording_name, run_dashboard
 from hil.link_stats import LinkStats
-from hil.publisher import Taps, run_publisher
+from hil.mcap_recorder import run_mcap
+from hil.publisher import Taps, link_options, run_publisher
+from hil.receiver import run_receiver
 from hil.recorder import run_recorder
 from hil.ring import Wake
-from hil.stats import Phase
+from hil.stats import Phase, Times
 from hil.warmup import STEPS
 from hil.world.head import run_head
 from nav.errors import HilError
@@ -33,12 +38,14 @@ from nav.state import NAV_STATE, Mode
 
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
-NICE = {"publisher": 10, "dashboard": 5}
+NICE = {"publisher": 10, "mcap": 10, "dashboard": 5}
 """How far a part steps back behind the loop where processors are few."""
 RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
+STOPPED_S = 3.0
+"""A reader without a beat for so long has stopped."""
 BUSY_NS = 500_000_000
 """A loop that has not asked for frames for so long is busy with those that it has."""
 DRAIN_S = 1.0
@@ -53,12 +60,16 @@ class _Part:
     process: BaseProcess
     connection: Connection
     answers: _Answers = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    """What it has told at once, and nobody has taken yet."""
 
     def read(self) -> None:
         """Take what the process has answered."""
         with contextlib.suppress(EOFError, OSError):
             while self.connection.poll():
-                self.answers.update(self.connection.recv())
+                said = self.connection.recv()
+                self.problems += [said.pop("problem")] if self.name == "recorder" and "problem" in said else []
+                self.answers.update(said)
 
 
 class Session:
@@ -75,6 +86,8 @@ class Session:
         Recording to write.
     publish : bool
         Send MAVLink on the links of the scenario.
+    mcap : Path, optional
+        File for Foxglove to write; in real time only.
     window : Window, optional
         Where the dashboard is served; None: nowhere.
     """
@@ -86,17 +99,22 @@ class Session:
         feeder: tuple[Callable[..., None], Sequence[Any]] | None = None,
         record: Path | None = None,
         publish: bool = True,
+        mcap: Path | None = None,
         window: Window | None = None,
     ) -> None:
+        if mcap is not None and not order.paced:
+            raise HilError("--mcap needs real time: record the run with --record FILE, then `hil export FILE out.mcap`")
         self.order = order
-        self.links = LinkStats(order.scenario.mavlink.links if publish else ())
+        self.links = LinkStats(link_options(order.scenario.mavlink) if publish else ())
         self.recordings: list[dict[str, Any]] = []
         """What became of the recordings that were asked for while running."""
         self._window = window
-        self.outlets = Outlets.make(recording=record is not None, readers=1)
+        self._receivers = {f"receiver {k}": one for k, one in enumerate(order.scenario.receiver if order.live else ())}
+        self.outlets = Outlets.make(recording=record is not None, readers=1, receivers=len(self._receivers))
         self._feeder = feeder
         self._record = record
         self._publish = publish
+        self._mcap = mcap
         self._publisher_stop = Wake()
         self._parts: dict[str, _Part] = {}
         self._event_number = 0
@@ -104,8 +122,12 @@ class Session:
         self._feeder_ended: float | None = None
         self._drained = 0
         """Frames that the loop had taken when it was last seen at work after the feeder's end."""
+        self._pulses = PulseClock()
         self._began = 0.0
         self._ended = 0.0
+        self._notes: list[tuple[float, str, str]] = []
+        self._stopped: set[str] = set()
+        """Readers that do not answer."""
         self.problems: list[str] = []
         """What went wrong with a part of the run without ending it."""
 
@@ -125,9 +147,10 @@ class Session:
     def _launch(self, name: str, target: Callable[..., None], *args: Any) -> None:
         context = mp.get_context("forkserver")
         ours, theirs = context.Pipe()
+        aside = self.order.realtime and name != "loop"
         process = context.Process(
             target=run_part,
-            args=(self.outlets.control, NICE.get(name, 0), target, *args, theirs),
+            args=(self.outlets.control, NICE.get(name, 0), aside, target, *args, theirs),
             name=f"hil-{name}",
             daemon=True,
         )
@@ -137,15 +160,17 @@ class Session:
 
     def _launch_recorder(self, path: Path) -> None:
         header = {"scenario": self.order.scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
+        self.outlets.control.forget_beat("recorder")
         self._launch("recorder", run_recorder, path, header, self.outlets)
 
     def _start(self) -> None:
         scenario, outlets, launch = self.order.scenario, self.outlets, self._launch
-        mp.get_context("forkserver").set_forkserver_preload(
-            ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
-        )
+        preload = ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
+        mp.get_context("forkserver").set_forkserver_preload([*preload, "hil.receiver"] if self._receivers else preload)
         if self._record is not None:
             self._launch_recorder(self._record)
+        if self._mcap is not None:
+            launch("mcap", run_mcap, self._mcap, outlets)
         launch("loop", run_loop, self.order, outlets)
         if self._feeder is not None:
             target, args = self._feeder
@@ -160,10 +185,12 @@ class Session:
             )
             self._window.socket.close()  # the port lives as long as its process
         if self._publish and scenario.mavlink.links:
-            live = self.order.paced and self.order.file is None
-            network, early = outlets.aiding if live else None, scenario.navigation.aligned_by_aiding
-            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, self.links)
+            network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
+            shared = outlets.stats, outlets.fixes, self.links
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
+        for k, (name, config) in enumerate(self._receivers.items()):
+            launch(name, run_receiver, config, k, outlets.stats, outlets.aiding[1 + k], outlets.control)
 
     def compiling(self) -> tuple[int, int]:
         """(steps done, steps in all) of getting ready."""
@@ -181,12 +208,13 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
-        recorder = self._parts.get("recorder")
-        if self.outlets.stats["phase"] == Phase.STARTING or (recorder and "ready" not in recorder.answers):
+        if self.outlets.control.go:
+            return True
+        heralds = [part for name, part in self._parts.items() if name in {"recorder", "mcap", *self._receivers}]
+        if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in heralds):
             return False
-        if not self.outlets.control.go:
-            self._began = time.monotonic()
-            self.outlets.control.order_go()
+        self._began = time.monotonic()
+        self.outlets.control.order_go()
         return True
 
     @property
@@ -199,6 +227,7 @@ class Session:
             The loop or the feeder failed.
         """
         self._watch()
+        self._pulses.poll()
         if not self.ready:
             return True
         feeder = self._parts.get("feeder")
@@ -225,9 +254,10 @@ class Session:
         if not control.record_since:
             control.recording = False
         if not recorder.process.is_alive():
-            recorder.read()
+            self._watch()
             control.recording, control.record_since = False, 0
-            self.recordings.append(recorder.answers)
+            self._stopped.discard("recorder")
+            self.recordings.append(self._answers("recorder"))
             del self._parts["recorder"]
 
     def wait_ready(self, on_wait: Callable[[], None] = lambda: None) -> None:
@@ -262,12 +292,17 @@ class Session:
         """A copy of the newest `NAV_STATE` row; None before the first."""
         return self._row[0].copy() if self.outlets.states.latest(self._row) else None
 
+    def wait(self, timeout_s: float) -> None:
+        """Sleep, but not longer than a part of the run lives."""
+        wait([part.process.sentinel for part in self._parts.values() if part.process.is_alive()], timeout_s)
+
     def events(self) -> list[tuple[float, str, str]]:
         """(device time, severity, text) of what happened since the last call."""
+        notes, self._notes = self._notes, []
         rows = np.zeros(64, EVENTS)
         copied, first = self.outlets.events.pull(rows, self._event_number)
         self._event_number = first + copied
-        return [
+        return notes + [
             (float(row["time"]), row["severity"].decode(), row["text"].decode(errors="replace"))
             for row in rows[:copied]
         ]
@@ -279,6 +314,8 @@ class Session:
     def _watch(self) -> None:
         for part in self._parts.values():
             part.read()
+            self.problems += part.problems
+            part.problems.clear()
             failed = part.answers.get("failed")
             died = part.process.exitcode not in (None, 0) and not failed
             if died:
@@ -288,20 +325,45 @@ class Session:
             if part.name in {"loop", "feeder"} or not self.outlets.control.go:
                 raise HilError(str(failed))
             if failed not in self.problems:
-                self.problems.append(str(failed))
+                self._note(str(failed), "error", problem=True)
+        for name in READERS:
+            self._look_at(name)
+
+    def _look_at(self, reader: str) -> None:
+        """Say that a reader has stopped, or goes on."""
+        part = self._parts.get(reader)
+        if part is None or part.process.exitcode is not None:
+            return
+        stopped = self.outlets.control.beat_age_s(reader) > STOPPED_S
+        if stopped and reader not in self._stopped:
+            self._stopped.add(reader)
+            self._note(
+                f"the {reader} process does not answer: it is stopped or starved, and nothing waits for it",
+                "error",
+                problem=True,
+            )
+        elif not stopped and reader in self._stopped:
+            self._stopped.discard(reader)
+            self._note(f"the {reader} process answers again", "notice")
+
+    def _note(self, text: str, severity: str, *, problem: bool = False) -> None:
+        state = self.state()
+        self._notes.append((0.0 if state is None else float(state["time"]), severity, text))
+        if problem:
+            self.problems.append(text)
 
     def _end(self) -> None:
         self._ended = time.monotonic()
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "publisher", "dashboard"):
+        for name in ("loop", "feeder", "recorder", "mcap", "publisher", *self._receivers, "dashboard"):
             part = self._parts.get(name)
             if part is None:
                 continue
             if name == "publisher":
                 self._publisher_stop.call()
-            patience = RECORDER_STOP_S if name == "recorder" else 0.0
+            patience = RECORDER_STOP_S if name in {"recorder", "mcap"} else 0.0
             while part.process.is_alive() and time.monotonic() < deadline + patience:
                 part.read()
                 part.process.join(0.02)
@@ -312,12 +374,19 @@ class Session:
             if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
             part.read()
+            self.problems += part.problems
+            part.problems.clear()
+
+    def _answers(self, name: str) -> _Answers:
+        part = self._parts[name]
+        part.read()
+        return {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
 
     def summary(self) -> dict[str, Any]:
         """What the run showed, as `hil run --json` prints it; complete after the end."""
         stats = self.outlets.stats
         names = ("frames", "samples", "lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors")
-        more = ("restarts", "interpolated", "silences")
+        more = ("restarts", "frozen", "clock_steps", "interpolated", "silences", "overruns")
         wall = max((self._ended or time.monotonic()) - self._began, 1e-9) if self._began else 0.0
         device_s = stats["covered_us"] * 1e-6
         result: dict[str, Any] = {"scenario": self.order.scenario.name}
@@ -325,21 +394,29 @@ class Session:
         result["rate_hz"] = stats["samples"] / device_s if device_s > 0 else 0.0
         result["wall_s"], result["device_s"] = wall, device_s
         result["speed"] = device_s / wall if wall else 0.0
-        result["latency_us"] = stats.latency_us()
-        for name in ("loop", "feeder", "publisher", "recorder", "dashboard"):
-            part = self._parts.get(name)
-            if part is not None:
-                part.read()
-                answers = {key: value for key, value in part.answers.items() if key not in {"failed", "ready"}}
+        result["latency_us"] = stats.quantiles_us(Times.LATENCY)
+        result["times_us"] = {what.name.lower(): stats.quantiles_us(what) for what in Times}
+        if (clock := clock_summary(stats)) is not None:
+            result["clock"] = clock
+            if (utc := self._pulses.summary()) is not None:
+                clock["utc"] = utc
+        for name in ("loop", "feeder", "publisher", "recorder", "mcap", "dashboard"):
+            if name in self._parts:
+                answers = self._answers(name)
                 if name == "loop":
                     result.update(answers)
                 else:
                     result[name] = answers
         if self.recordings:
             result["recordings"] = self.recordings
+        if "wire" in result.get("feeder", {}):
+            result["wire"] = result["feeder"].pop("wire")
+        if self._receivers:
+            result["receivers"] = [self._answers(name) for name in self._receivers]
         result["mavlink_sent"] = result.get("publisher", {}).get("sent", {})
-        if self.problems:
-            result["problems"] = self.problems
+        told = [one["problem"] for one in result.get("receivers", []) if "problem" in one]
+        if self.problems or told:
+            result["problems"] = self.problems + told
         return result
 
 

@@ -10,6 +10,7 @@ from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from hil.magnetic import magnetic_field
 from hil.scenario import Scenario
 from hil.world.instruments import axis_drift, mounting, sensors_of
+from nav.aiding import AT_PORTS
 from nav.alignment.rest import UNSTATED
 from nav.earth import STANDARD_GRAVITY
 from nav.filter.aided import Settings as FilterSettings
@@ -51,10 +52,16 @@ def settings_of(scenario: Scenario) -> Settings:
     )
 
 
+def antennas_of(scenario: Scenario) -> dict[int, tuple[float, float, float]]:
+    """From the head to the antenna of each receiver, m, by its source: those on the bus, then those at ports of their own."""
+    arms = {k: one.lever_arm_m for k, one in enumerate(scenario.aiding.gnss)}
+    arms |= {k: one.lever_arm_m for k, one in enumerate(scenario.receiver, AT_PORTS)}
+    return {k: _three(np.subtract(arm, scenario.head.lever_arm_m)) for k, arm in arms.items()}
+
+
 def antenna_of(scenario: Scenario) -> tuple[float, float, float]:
     """From the head to the first receiver's antenna, m."""
-    gnss = scenario.aiding.gnss
-    return _three(np.subtract(gnss[0].lever_arm_m, scenario.head.lever_arm_m) if gnss else np.zeros(3))
+    return next(iter(antennas_of(scenario).values()), (0.0, 0.0, 0.0))
 
 
 def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
@@ -88,7 +95,10 @@ def aiding_of(scenario: Scenario, lat: float, lon: float) -> Aiding:
     return Aiding(
         believed,
         FilterSettings(
-            lever_arm=antenna_of(scenario), field_n=_three(field_n), magnetic_heading=chosen.magnetic == "heading"
+            lever_arm=antenna_of(scenario),
+            antennas=tuple(antennas_of(scenario).items()),
+            field_n=_three(field_n),
+            magnetic_heading=chosen.magnetic == "heading",
         ),
         np.array([5.0, 5.0, 5.0, 0.05, 0.05, 0.05, tilt, tilt, math.radians(start.heading_sigma_deg)]),
         assumptions,

@@ -8,9 +8,10 @@ import numpy as np
 
 from drivers.can.frames import FrameArray, frames
 from hil.bridge import BATCH, Loop, LoopOrder, Outlets, take_with_events
+from hil.flight_log import is_flight_log
 from hil.offline import nav_rows
 from hil.offline_aided import AIDED_HEADER
-from hil.player import is_imu_log, timed
+from hil.player import timed
 from hil.scenario import Scenario
 from hil.source import FileSource
 from hil.tables import write_table
@@ -35,7 +36,7 @@ def smooth_recording(path: Path, scenario: Scenario, out: Path) -> dict[str, Any
     scenario = scenario.with_changes(navigation={"aided": True})
     recorder = Recorder()
     loop = Loop(LoopOrder(scenario, file=path, paced=False), Outlets.make(recording=False, readers=1), recorder)
-    for batch in _batches(path):
+    for batch in batches(path):
         take_with_events(loop, batch)
         if loop.finished:
             break
@@ -59,8 +60,9 @@ def smooth_recording(path: Path, scenario: Scenario, out: Path) -> dict[str, Any
     return report
 
 
-def _batches(path: Path) -> Iterator[FrameArray]:
-    if is_imu_log(path):
+def batches(path: Path) -> Iterator[FrameArray]:
+    """The frames of a recording or a flight log, events among them, for a loop without a bus; each valid until the next."""
+    if is_flight_log(path):
         for _, batch in timed(path, one_by_one=False):
             yield batch
         return

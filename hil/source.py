@@ -11,8 +11,12 @@ import numpy as np
 from drivers.can.bus import open_port
 from drivers.can.convert import from_message
 from drivers.can.frames import FrameArray, frames
+from drivers.logs.blf import BlfReader
 from drivers.logs.recording import EVENT, MAGIC, RecordingReader
 from nav.errors import HilError
+
+_READERS: dict[str, Any] = {".log": can.CanutilsLogReader, ".blf": BlfReader, ".asc": can.ASCReader}
+"""By file ending; python-can finds the others itself, among its plug-ins."""
 
 
 class Source(Protocol):
@@ -22,6 +26,14 @@ class Source(Protocol):
     """Arrival times are those of the host now: silence and latency mean something."""
     exhausted: bool
     """Nothing more will come."""
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing can come now, with what mends it; empty when all is well."""
+
+    @property
+    def overflowed(self) -> int:
+        """Frames that the kernel dropped because we did not take them in time."""
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """As `drivers.can.bus.Port.receive`."""
@@ -41,6 +53,11 @@ class BusSource:
         self.exhausted = False
         self._port = open_port(url, lossless=not paced)
 
+    @property
+    def trouble(self) -> str:
+        """See `Source.trouble`."""
+        return getattr(self._port, "trouble", "")
+
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """See `Source.receive`."""
         return self._port.receive(batch, timeout)
@@ -50,9 +67,20 @@ class BusSource:
         self._port.close()
 
     def problem(self) -> str:
-        """Failures of the interface."""
+        """Failures of the interface, and frames that it lost."""
         failures = getattr(self._port, "failures", 0)
-        return f"the bus failed {failures} times and was reopened" if failures else ""
+        said = [f"the bus failed {failures} times and was reopened"] if failures else []
+        if self.overflowed:
+            said.append(
+                f"{self.overflowed} frames were lost because the receive buffer was full: raise net.core.rmem_max"
+            )
+        return "; ".join(said)
+
+    @property
+    def overflowed(self) -> int:
+        """See `Source.overflowed`."""
+        count: int = getattr(self._port, "overflowed", 0)
+        return count
 
 
 class FileSource:
@@ -65,6 +93,9 @@ class FileSource:
     paced : bool
         Hand frames out at the times at which they were recorded; else as fast as they are asked for.
     """
+
+    trouble = ""
+    overflowed = 0
 
     def __init__(self, path: Path, *, paced: bool) -> None:
         self.live = False
@@ -86,7 +117,7 @@ class FileSource:
     def _foreign(self) -> Iterator[FrameArray]:
         chunk, n, total = frames(256), 0, 0
         try:
-            with can.LogReader(self.path) as reader:
+            with _READERS.get(self.path.suffix.lower(), can.LogReader)(self.path) as reader:
                 for message in reader:
                     from_message(message, chunk[n])
                     n += 1

@@ -106,5 +106,5 @@ def parquet() -> Any:
     try:
         from pyarrow import parquet as module
     except ImportError as error:
-        raise HilError("parquet files need pyarrow: pip install pyarrow, or use .csv or .npz") from error
+        raise HilError("parquet files need pyarrow: pip install 'dtg-hil[parquet]', or use .csv or .npz") from error
     return module

@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RELAYED = 128
+"""Sources from here on are those of another network, for which a relay sends."""
+AT_PORTS = 192
+"""Sources from here on to 255 are receivers at ports of their own, each of which sends for itself."""
 """Sources from here on to 255 are those of another network, for which a relay sends."""
+RECEIVERS = 16
+"""Relayed sources up to here are receivers, as all that are not relayed."""
+OPERATOR = RELAYED + 18
+"""The source of what a person says: a navigator without a filter takes it as it is."""
 
 
 class Kind(IntEnum):
@@ -76,3 +83,9 @@ def aiding_rows(
     rows["time"], rows["kind"], rows["source"], rows["sigma"] = times, kind, source, np.inf
     rows["value"][:, : values.shape[1]], rows["sigma"][:, : sigmas.shape[1]] = values, sigmas
     return rows
+
+
+def of_receivers(rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Which of `rows` (n,) are fixes of satellite receivers."""
+    found: NDArray[np.bool_] = (rows["kind"] == Kind.GNSS) & (rows["source"] < RELAYED + RECEIVERS)
+    return found

@@ -10,10 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nav.increments import FloatArray, ImuIncrements, Validity
+from nav.increments import FloatArray, ImuIncrements, Validity, joined
+from nav.kernel import kernel
 
 MAX_FILL = 4096
 """Most steps put into one gap; a longer one gets longer steps."""
+
+
+@kernel
+def _rates(
+    step: FloatArray, dtheta: FloatArray, dvel: FloatArray, row: int, rate: FloatArray, force: FloatArray
+) -> None:
+    while row >= 0 and step[row] <= 0.0:  # a sample without length has no rate: the one before it counts
+        row -= 1
+    if row >= 0:
+        for i in range(3):
+            rate[i], force[i] = dtheta[row, i] / step[row], dvel[row, i] / step[row]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +88,7 @@ class GapFiller:
         return result, gaps
 
     def _keep(self, imu: ImuIncrements, row: int) -> None:
-        while row >= 0 and imu.step[row] <= 0.0:  # a sample without length has no rate: the one before it counts
-            row -= 1
-        if row >= 0:
-            self._rate[:] = imu.dtheta[row] / imu.step[row]
-            self._force[:] = imu.dvel[row] / imu.step[row]
+        _rates(imu.step, imu.dtheta, imu.dvel, row, self._rate, self._force)
 
     def _filled(self, imu: ImuIncrements, jumps: np.ndarray) -> tuple[ImuIncrements, list[Gap]]:
         parts: list[ImuIncrements] = []
@@ -108,7 +116,7 @@ class GapFiller:
                 rows += len(fill)
             start = stop
         parts.append(imu.rows(start, len(imu)))
-        return _joined(parts), gaps
+        return joined(parts), gaps
 
     def _interpolated(
         self, imu: ImuIncrements, row: int, time: float, length: float, sequence: int, missing: int, bridged: bool
@@ -129,9 +137,3 @@ class GapFiller:
             np.full(count, mark, np.int64),
             numbers,
         )
-
-
-def _joined(parts: list[ImuIncrements]) -> ImuIncrements:
-    return ImuIncrements(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ImuIncrements.__dataclass_fields__)
-    )

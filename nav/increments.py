@@ -5,6 +5,7 @@ A batch is a set of equally long arrays, one row a sample. `ImuIncrements` is wh
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 
@@ -100,6 +101,13 @@ class ImuIncrements:
         return ImuIncrements(
             np.zeros(n), np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, np.int64), np.zeros(n, np.int64)
         )
+
+
+def joined(parts: Sequence[ImuIncrements]) -> ImuIncrements:
+    """Batches one after the other, as a new one."""
+    return ImuIncrements(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ImuIncrements.__dataclass_fields__)
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from nav.aiding import OPERATOR, Kind
 from nav.alignment import rest
 from nav.alignment.chain import aligner, check_grade
 from nav.alignment.plan import GIVEN_UP, Plan, Start, Way, Word
 from nav.alignment.rest import UNSTATED, Sensors
+from nav.earth import curvature_radii
 from nav.errors import HilError
-from nav.filter.aided import AidedNavigator, Answers
+from nav.filter.aided import AidedNavigator
 from nav.filter.aided import Settings as FilterSettings
 from nav.filter.assumptions import Assumed, Assumptions
 from nav.filter.record import Recorder
@@ -25,13 +27,14 @@ from nav.filter.states import GYRO_BIAS, Tuning
 from nav.filter.watch import Watch
 from nav.frames import earth_rate_in_body
 from nav.gaps import Gap, GapFiller, GapPolicy
-from nav.increments import FloatArray, ImuIncrements, Validity
+from nav.increments import FloatArray, ImuIncrements, IntArray, Validity
+from nav.kernel import kernel
 from nav.lever_arm import shift
 from nav.rotation import euler_from_quaternion
-from nav.state import NAV_STATE, Health, Mode
-from nav.strapdown import Strapdown
+from nav.solutions import Solutions, StateArray
+from nav.state import Health, Mode, Ratio
+from nav.strapdown import Answers, Strapdown
 
-StateArray = NDArray[Any]
 Severity = Literal["info", "notice", "warning", "error"]
 
 DISTRUST = Health.SILENT | Health.BRIDGED | Health.SENSOR
@@ -157,11 +160,12 @@ class Navigator:
         self._sums = np.zeros(rest.SUMS)
         self._state = _solution(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
         self._arm = np.asarray(settings.lever_arm, float)
+        self._has_arm = bool(self._arm.any())
         self._aligner = aligner(self._plan, self._state[:3])
         self._progress = 0.0
         self._events: list[Event] = []
-        self._rows = np.zeros(256, NAV_STATE)
-        self._scratch = (np.empty((256, 3)), np.empty((256, 3)), np.empty((256, 4)))
+        self._solutions = Solutions()
+        self._worthless = np.full(9, np.inf, np.float32), np.zeros(len(Ratio), np.float32)
 
     def events(self) -> list[Event]:
         """What happened since the last call."""
@@ -206,29 +210,54 @@ class Navigator:
     def aid(self, rows: NDArray[Any]) -> None:
         """Take measurements (:data:`nav.aiding.AIDING`): for the alignment, then for the filter, if there is one.
 
+        Without a filter an operator's position and heading are taken as they are, and nothing else is.
+
         Raises
         ------
         HilError
             A value or a standard deviation that is used is no number.
         """
         if self.mode == Mode.ALIGN:
-            if not (
-                np.isfinite(rows["time"]).all() and np.isfinite(rows["value"]).all() and (rows["sigma"] > 0.0).all()
-            ):
-                raise HilError("aiding row: a value is no number, or a sigma is not positive: mend what sends it")
+            _check(rows)
             self._aligner.aid(rows)
-        elif self._aided is not None and self.mode in (Mode.NAVIGATE, Mode.DEGRADED):
+        elif self.mode not in (Mode.NAVIGATE, Mode.DEGRADED):
+            return
+        elif self._aided is None:
+            words = rows[rows["source"] == OPERATOR]
+            _check(words)
+            for word in words:
+                self._set(word)
+        else:
             self._aided.aid(rows)
             for restart in self._aided.restarts():
                 text = "the filter had diverged: it starts again where GNSS says"
                 self.tell(restart.time, "warning", text, station=True)
+
+    def _set(self, word: Any) -> None:
+        """Move or turn the solution to what an operator says."""
+        core, given = self._core, word["value"]
+        if word["kind"] == Kind.GNSS:
+            lat, lon, height = core.solution[:3]
+            meridian, prime = curvature_radii(math.sin(lat))
+            north = (lat - given[0]) * (meridian + height)
+            east = math.remainder(lon - given[1], 2.0 * math.pi) * (prime + height) * math.cos(lat)
+            core.correct(np.array([north, east, 0.0]), np.zeros(3), np.zeros(3))
+            what = "position"
+        elif word["kind"] == Kind.HEADING:
+            turn = math.remainder(euler_from_quaternion(core.solution[6:10])[0] - given[0], 2.0 * math.pi)
+            core.correct(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, turn]))
+            what = "heading"
+        else:
+            return
+        self._state[:] = core.solution
+        self.tell(float(word["time"]), "notice", f"the {what} is the operator's", station=True)
 
     def silent(self) -> StateArray:
         """The sensor has fallen silent: one row that repeats the last state and says so."""
         self.health |= Health.SILENT
         if self.mode == Mode.NAVIGATE:
             self.mode = Mode.DEGRADED
-        row = self._rows[:1]
+        row = self._solutions.last
         row["mode"], row["health"] = self.mode, self.health
         self.tell(float(row["time"][0]), "error", "no samples: the sensor is silent")
         return row
@@ -246,10 +275,9 @@ class Navigator:
             raise HilError(f"increment {int(imu.sequence[bad])} is not a number: mend the driver or the file")
         imu, gaps = self._filler.fill(imu)
         n = len(imu)
+        rows = self._solutions.room(n)
         if n == 0:
-            return self._rows[:0]
-        rows = self._room(n)
-        rows["time"], rows["sequence"] = imu.time, imu.sequence
+            return rows
         if self.mode == Mode.INIT:
             self.realign(float(imu.time[0]), self._plan.order)
         if self.health & Health.SILENT:
@@ -259,24 +287,22 @@ class Navigator:
                 self._trust(float(imu.time[0]))
         start = 0
         for gap in gaps:
-            self._run(imu, rows, start, gap.row)
+            self._run(imu, start, gap.row)
             self._meet(gap)
             start = gap.row
-        self._run(imu, rows, start, n)
-        step = np.where(imu.step > 0.0, imu.step, 1.0)[:, None]
-        rows["w_ib_b"] = imu.dtheta / step - rows["gyro_bias"]
-        rows["f_b"] = imu.dvel / step
-        if self._arm.any():
+        self._run(imu, start, n)
+        self._solutions.add_samples(imu)
+        if self._has_arm:
             there = np.ascontiguousarray(rows[rows["mode"] >= Mode.NAVIGATE])
             point = there["lat"], there["lon"], there["height"], there["vel_n"]
             shift(*point, there["q_nb"], there["w_ib_b"], -self._arm)
             rows[rows["mode"] >= Mode.NAVIGATE] = there
-        self._rows[0] = rows[-1]  # what `silent` repeats
+        self._solutions.keep_last(n)  # what `silent` repeats
         return rows
 
     def _move(self, sign: float, w_ib_b: FloatArray | None = None) -> None:
         """Move the state from the navigated point to the sensor (`sign` 1) or back (-1)."""
-        if not self._arm.any():
+        if not self._has_arm:
             return
         lat, lon, height, vel_n, q_nb = (self._state[part] for part in (_LAT, _LON, _HEIGHT, _VEL, _Q))
         rate = np.zeros((1, 3)) if w_ib_b is None else np.asarray(w_ib_b, float).reshape(1, 3)
@@ -294,33 +320,22 @@ class Navigator:
         if self._assumed is not None:
             self._assumed.start(lat, lon, height)
 
-    def _room(self, n: int) -> StateArray:
-        if n + 1 > len(self._rows):
-            size = 2 * n + 1
-            self._rows = np.zeros(size, NAV_STATE)
-            self._scratch = (np.empty((size, 3)), np.empty((size, 3)), np.empty((size, 4)))
-        return self._rows[1 : n + 1]
-
-    def _run(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> None:
-        flags = imu.validity & _FLAGS if imu.validity[start:stop].any() else None
+    def _run(self, imu: ImuIncrements, start: int, stop: int) -> None:
         while start < stop:
-            end = stop
-            flagged = 0 if flags is None else int(flags[start])
-            if flags is not None:  # up to the next change of the sensor's own flag
-                changes = np.flatnonzero(flags[start:stop] != flags[start])
-                end = start + int(changes[0]) if len(changes) else stop
+            end = _same_flags(imu.validity, start, stop)
+            flagged = int(imu.validity[start]) & _FLAGS
             if flagged != self._flagged:
                 self._flag(float(imu.time[start]), flagged)
-            start += (self._align if self.mode == Mode.ALIGN else self._navigate)(imu, rows, start, end)
+            start += (self._align if self.mode == Mode.ALIGN else self._navigate)(imu, start, end)
 
-    def _align(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
+    def _align(self, imu: ImuIncrements, start: int, stop: int) -> int:
         used, word = self._aligner.take(imu, start, stop)
         last = start + used - 1
-        self._fill_constant(rows[start:last])  # what a sample brings shows from it on
+        self._fill_constant(start, last)  # what a sample brings shows from it on
         if word is not None:
             self._hear(float(imu.time[last]), word)
         self._progress = self._aligner.progress if self.mode == Mode.ALIGN else 1.0
-        self._fill_constant(rows[last : last + 1])
+        self._fill_constant(last, last + 1)
         return used
 
     def _hear(self, time: float, word: Word) -> None:
@@ -349,7 +364,7 @@ class Navigator:
         )
         self._trust(time)
 
-    def _navigate(self, imu: ImuIncrements, rows: StateArray, start: int, stop: int) -> int:
+    def _navigate(self, imu: ImuIncrements, start: int, stop: int) -> int:
         event = 0
         if self._watch is not None:
             stop = start + self._watch.part(imu.time[start:stop])
@@ -364,13 +379,8 @@ class Navigator:
                 self._sums, imu.step[start:stop], imu.dtheta[start:stop], imu.dvel[start:stop], REST_WINDOW_S
             )
             stop = start + used
-        position, velocity, attitude = self._advance(imu.rows(start, stop))
-        part = rows[start:stop]
-        part["mode"], part["health"] = self.mode, self.health
-        part["lat"], part["lon"], part["height"] = position[:, 0], position[:, 1], position[:, 2]
-        part["vel_n"], part["q_nb"], part["gyro_bias"] = velocity, attitude, self.gyro_bias
-        part["progress"] = 1.0
-        self._fill_worth(part)
+        answers = self._advance(imu if stop - start == len(imu) else imu.rows(start, stop))
+        self._fill(start, stop, 1.0, answers)
         if event == 2:
             self._track_bias()
         if self._assumed is not None and self._aided is not None and self._assumed.detector.decided:
@@ -381,9 +391,8 @@ class Navigator:
         """Carry the solution over samples: place, velocity, attitude at each, valid until the next call."""
         n, before = len(imu), self._core.mechanization
         if self._aided is None:
-            self._room(n)
-            position, velocity, attitude = out = Answers(*(array[:n] for array in self._scratch))
-            done = self._core.advance(imu.step, imu.dtheta, imu.dvel, self.gyro_bias, position, velocity, attitude)
+            out = self._solutions.answers(n)
+            done = self._core.advance(imu.step, imu.dtheta, imu.dvel, self.gyro_bias, *out)
         else:
             out = self._aided.process(imu)
             self.gyro_bias = self._aided.estimates[GYRO_BIAS].copy()
@@ -438,17 +447,28 @@ class Navigator:
     def tell(self, time: float, severity: Severity, text: str, *, station: bool = False) -> None:
         self._events.append(Event(time, severity, text, station))
 
-    def _fill_constant(self, part: StateArray) -> None:
-        part["mode"], part["health"] = self.mode, self.health
-        part["lat"], part["lon"], part["height"] = self._state[0], self._state[1], self._state[2]
-        part["vel_n"], part["q_nb"], part["gyro_bias"] = self._state[3:6], self._state[6:10], self.gyro_bias
-        part["progress"] = self._progress
-        self._fill_worth(part)
+    def _fill_constant(self, start: int, stop: int) -> None:
+        state = self._state
+        self._fill(start, stop, self._progress, Answers(state[None, :3], state[None, 3:6], state[None, 6:10]))
 
-    def _fill_worth(self, part: StateArray) -> None:
-        part["sigma"], part["test_ratio"] = np.inf, 0.0
-        if self._watch is not None and self.mode >= Mode.NAVIGATE:
-            part["sigma"], part["test_ratio"] = self._watch.sigma, self._watch.ratio
+    def _fill(self, start: int, stop: int, progress: float, answers: Answers) -> None:
+        known = self._watch is not None and self.mode >= Mode.NAVIGATE
+        worth = (self._watch.sigma, self._watch.ratio) if known and self._watch else self._worthless
+        self._solutions.fill(start, stop, (int(self.mode), int(self.health), progress), answers, self.gyro_bias, worth)
+
+
+@kernel
+def _same_flags(validity: IntArray, start: int, stop: int) -> int:
+    """The end of the samples from `start` on that the sensor flags alike."""
+    for k in range(start + 1, stop):
+        if (validity[k] ^ validity[start]) & _FLAGS:
+            return k
+    return stop
+
+
+def _check(rows: NDArray[Any]) -> None:
+    if not (np.isfinite(rows["time"]).all() and np.isfinite(rows["value"]).all() and (rows["sigma"] > 0.0).all()):
+        raise HilError("aiding row: a value is no number, or a sigma is not positive: mend what sends it")
 
 
 def _plan(settings: Settings) -> Plan:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from copy import deepcopy
 from types import MethodType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,8 +36,15 @@ ATTITUDES = (
 
 
 _push: Any = kernels.push
-Answers = tuple[FloatArray, FloatArray, FloatArray]
-"""Room for position, velocity and attitude."""
+_Body = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+class Answers(NamedTuple):
+    """The solution at the end of each sample: lat, lon (rad), height (m); vel_n, m/s; q_nb."""
+
+    position: FloatArray
+    velocity: FloatArray
+    attitude: FloatArray
 
 
 class Strapdown:
@@ -107,12 +114,13 @@ class Strapdown:
 
     def __getstate__(self) -> dict[str, Any]:
         """What copies and pickles are made of: all but the ways into the core."""
-        ways = "_memory", "_state", "solution", "_azimuth", "push"
+        ways = "_memory", "_state", "solution", "_azimuth", "push", "_seen"
         return {name: value for name, value in self.__dict__.items() if name not in ways}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on with a core of one's own."""
         self.__dict__.update(deepcopy(state))
+        self._seen = dict[int, _Body]()
         self._look()
 
     @property
@@ -141,6 +149,7 @@ class Strapdown:
         self.solution[:] = place
         self._settle(self._first, azimuth)
         self._memory[:] = 0.0
+        self._sound = True
         self._q = np.array([1.0, 0.0, 0.0, 0.0])
         self._stream = None if self._method is None else self._method.stream(self._q)
         young = self._window > 2 and not self._blocks
@@ -274,21 +283,23 @@ class Strapdown:
         if bad >= 0 or not math.isfinite(gyro_bias[0] + gyro_bias[1] + gyro_bias[2]):
             what = "the gyro bias" if bad < 0 else f"increment {bad} of the batch"
             raise HilError(f"strapdown: {what} is not a number: mend the driver or the file")
-        if n > len(self._dq):
+        if n > len(self._body[0]):
             self._room(2 * n)
-        out = position, velocity, attitude
+        out = Answers(position, velocity, attitude)
         done = 0
         while done < n and self._lead is not None:
             one = slice(done, done + 1)
-            there = position[one], velocity[one], attitude[one]
+            there = Answers(position[one], velocity[one], attitude[one])
             if not self._advance(step[one], dtheta[one], dvel[one], gyro_bias, there):
                 alone = done
             self._lead_in(self._lead, step[done], dtheta[done] - gyro_bias * step[done], dvel[done], there)
             done += 1
-        if done < n:
-            there = position[done:], velocity[done:], attitude[done:]
+        if done == 0 < n:
+            alone = self._advance(step, dtheta, dvel, gyro_bias, out)
+        elif done < n:
+            there = Answers(position[done:], velocity[done:], attitude[done:])
             alone = min(alone, done + self._advance(step[done:], dtheta[done:], dvel[done:], gyro_bias, there))
-        if n and not np.isfinite(self.solution).all():
+        if not self._sound:
             bad = int(np.flatnonzero(~np.isfinite(np.hstack(out)).all(axis=1))[0])
             raise HilError(f"strapdown: increment {bad} of the batch is too large to be one: start again without it")
         return alone
@@ -297,8 +308,8 @@ class Strapdown:
         self, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, gyro_bias: FloatArray, out: Answers
     ) -> int:
         n = len(step)
-        body = self._dq[:n], self._dv[:n], self._ds[:n]
-        code, azimuths = MECHANIZATIONS.index(self.mechanization), self._azimuths[:n]
+        code, (dq, dv, ds, azimuths) = int(self._core[kernels.CODE]), self._views(n)
+        body = dq, dv, ds
         if self._stream is None and (not self._blocks or (step > 0.0).all()):
             how = code, self._field, self._window, self._blocks
             work = self._memory, self._state, gyro_bias
@@ -326,9 +337,9 @@ class Strapdown:
 
     def _keep(self, n: int, out: Answers) -> None:
         if n:
-            self.solution[0:3], self.solution[3:6], self.solution[6:10] = (array[n - 1] for array in out)
+            self._sound = _last(n - 1, *out, self.solution)
             if self.mechanization == "wander":
-                self._azimuth[0] = self._azimuths[n - 1]
+                self._azimuth[0] = self._body[3][n - 1]
 
     def _lead_in(self, lead: list[FloatArray], step: float, dtheta: FloatArray, dvel: FloatArray, out: Answers) -> None:
         """The first samples were taken with less than the full order: when the window is full, take them again as a block."""
@@ -339,12 +350,12 @@ class Strapdown:
             return
         rows = np.array(lead)
         data = [np.ascontiguousarray(part) for part in (rows[:, 0], rows[:, 1:4], rows[:, 4:7])]
-        again = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
-        body = self._dq[:n], self._dv[:n], self._ds[:n]
+        again = Answers(np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)))
+        dq, dv, ds, azimuths = self._views(n)
         self._state[:] = self._origin
         how = MECHANIZATIONS.index(self.mechanization), self._field, self._window, True
         work = self._memory, self._state, np.zeros(3)
-        kernels.advance(*how, *work, data[0], data[1], data[2], *body, *again, self._azimuths[:n])
+        kernels.advance(*how, *work, data[0], data[1], data[2], dq, dv, ds, *again, azimuths)
         self._keep(n, again)
         for array, value in zip(out, again, strict=True):
             array[0] = value[-1]
@@ -364,8 +375,16 @@ class Strapdown:
         return kernels.DONE
 
     def _room(self, n: int) -> None:
-        self._dq, self._dv, self._ds = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3))
-        self._azimuths = np.zeros(n)
+        self._body = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
+        self._seen = dict[int, _Body]()
+
+    def _views(self, n: int) -> _Body:
+        """Room for the body integrals (rotation, velocity, position) and azimuths of `n` samples."""
+        views = self._seen.get(n)
+        if views is None:
+            dq, dv, ds, azimuths = self._body
+            views = self._seen[n] = dq[:n], dv[:n], ds[:n], azimuths[:n]
+        return views
 
     def _turn(self, stream: attitudes.AttitudeStream, step: FloatArray, dtheta: FloatArray) -> None:
         """Replace the rotation by that of the attitude method."""
@@ -373,8 +392,21 @@ class Strapdown:
         rows = np.empty((n, 4))
         stream.push(step, np.ascontiguousarray(dtheta), rows)
         before = np.concatenate([self._q[None], rows[:-1]])
-        turns_between(before, rows, self._dq[:n])
+        turns_between(before, rows, self._body[0][:n])
         self._q = rows[-1].copy()
+
+
+@kernel
+def _last(row: int, position: FloatArray, velocity: FloatArray, attitude: FloatArray, solution: FloatArray) -> bool:
+    """Keep the last solution; whether all of it are numbers."""
+    for i in range(3):
+        solution[i], solution[3 + i] = position[row, i], velocity[row, i]
+    for i in range(4):
+        solution[6 + i] = attitude[row, i]
+    total = 0.0
+    for i in range(10):
+        total += solution[i]
+    return math.isfinite(total)
 
 
 @kernel

@@ -1,8 +1,9 @@
 """Measurements that aid the navigator, on CAN FD: rows of `AIDING` to frames of `fixtures/can/aiding.dbc` and back.
 
-One frame a measurement, AUTOSAR E2E as for the head; a relay (:data:`nav.aiding.RELAYED`) counts its frames for itself. A
-standard deviation of 0 on the wire is an infinite one: the value is not there. The frames carry 32 bits of the inertial
-sensor's clock in us; they are unwrapped next to the newest time of that sensor. A classic bus cannot carry them.
+One frame a measurement, AUTOSAR E2E as for the head; a relay (:data:`nav.aiding.RELAYED`) and each receiver at a port of
+its own (:data:`nav.aiding.AT_PORTS`) count their frames for themselves. A standard deviation of 0 on the wire is an infinite
+one: the value is not there. The frames carry 32 bits of the inertial sensor's clock in us; they are unwrapped next to the
+newest time of that sensor. A classic bus cannot carry them.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from drivers import Counters
 from drivers.can.codec import MessageCodec, load_database
 from drivers.can.frames import BRS, FDF, FrameArray, frames
 from drivers.can.integrity import Protection, protection
-from nav.aiding import AIDING, RELAYED, Kind
+from nav.aiding import AIDING, AT_PORTS, RELAYED, Kind
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
 
@@ -136,7 +137,7 @@ class AidingDecoder:
 
     def __init__(self) -> None:
         self._by_id = {message.codec.can_id: message for message in _messages().values()}
-        self._last: dict[tuple[Kind, bool], int] = {}
+        self._last: dict[tuple[Kind, int], int] = {}
         self.counters = Counters()
         """As for a board: `samples` are measurements, `restarts` counters that went back, `foreign` unused reserved ids."""
         self.heard = dict.fromkeys(_messages(), 0)
@@ -182,13 +183,14 @@ class AidingDecoder:
         ours = data[:, 3] == PROTOCOL
         self.counters.version_errors += int((good & ~ours).sum())
         good &= ours
-        relayed = data[:, 4] >= RELAYED
-        for sender in np.unique(relayed[good]).tolist():
-            chosen = np.flatnonzero(good & (relayed == sender))
+        source = data[:, 4]
+        senders = np.where(source >= AT_PORTS, source, np.where(source >= RELAYED, RELAYED, 0))
+        for sender in np.unique(senders[good]).tolist():
+            chosen = np.flatnonzero(good & (senders == sender))
             good[chosen] = self._counted((message.kind, sender), data[chosen, 2].astype(np.int64))
         return good
 
-    def _counted(self, key: tuple[Kind, bool], numbers: IntArray) -> NDArray[np.bool_]:
+    def _counted(self, key: tuple[Kind, int], numbers: IntArray) -> NDArray[np.bool_]:
         """Which of the counters of one sender are new."""
         steps = np.diff(numbers, prepend=self._last.get(key, numbers[0] - 1)) % 256
         self._last[key] = int(numbers[-1])

@@ -1,7 +1,8 @@
 """Opening a bus by URL: the bulk interface that the bridge, the head and the tools use on every CAN back end.
 
 ``unix:NAME`` (:mod:`drivers.can.unix_bus`), ``socketcan:vcan0`` (:mod:`drivers.can.socketcan`) and
-``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own; anything else is python-can: ``virtual:NAME``,
+``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own (``socketcan:can0?filter=120:7F0`` has the kernel keep
+other frames back), as is ``mavlink:LINK`` (:mod:`drivers.mavlink.port`); anything else is python-can: ``virtual:NAME``,
 ``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
 """
 
@@ -16,7 +17,7 @@ import can
 
 from drivers.can.convert import from_message, to_message
 from drivers.can.frames import FrameArray
-from drivers.can.socketcan import SocketCanPort, explain
+from drivers.can.socketcan import SocketCanPort, explain, parse_filters
 from drivers.can.unix_bus import UnixPort
 from nav.errors import HilError
 
@@ -70,9 +71,15 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
         from drivers.serial.port import SerialPort
 
         return SerialPort(url)
-    if interface == "socketcan" and not query:
-        return SocketCanPort(channel, listen=listen)
-    options = {key: _typed(value) for key, value in parse_qsl(query, keep_blank_values=True)}
+    if interface == "mavlink":
+        from drivers.mavlink.port import MavlinkPort
+
+        return MavlinkPort(rest)
+    words = dict(parse_qsl(query, keep_blank_values=True))
+    if interface == "socketcan" and words.keys() <= {"filter"}:
+        filters = parse_filters(words["filter"]) if words else ()
+        return SocketCanPort(channel, listen=listen, filters=filters)
+    options = {key: _typed(value) for key, value in words.items()}
     return PythonCanPort(url, interface, channel, options)
 
 
@@ -83,6 +90,8 @@ class PythonCanPort:
         self.url = url
         self.dropped = 0
         self.failures = 0
+        self.trouble = ""
+        """Why it cannot be used now."""
         self._arguments = {"interface": interface, "channel": channel, **options}
         if interface in {"socketcan", "virtual"}:
             self._arguments.setdefault("fd", True)
@@ -103,6 +112,7 @@ class PythonCanPort:
 
     def _failed(self) -> None:
         self.failures += 1
+        self.trouble = f"bus {self.url}: the interface failed"
         if self._bus is not None:
             with contextlib.suppress(Exception):
                 self._bus.shutdown()
@@ -113,7 +123,9 @@ class PythonCanPort:
         if self._bus is None and time.monotonic() >= self._retry:
             try:
                 self._bus = self._open()
-            except HilError:
+                self.trouble = ""
+            except HilError as error:
+                self.trouble = str(error)
                 self._retry = time.monotonic() + REOPEN_S
         return self._bus
 

@@ -17,7 +17,7 @@ def from_message(message: can.Message, row: Any) -> None:
         | (RTR if message.is_remote_frame else 0)
         | (ERR if message.is_error_frame else 0)
     )
-    row["length"] = message.dlc if message.is_remote_frame else len(data)
+    row["length"] = min(message.dlc, 8) if message.is_remote_frame else len(data)
     row["flags"] = (
         (FDF if message.is_fd else 0)
         | (BRS if message.bitrate_switch else 0)

@@ -2,10 +2,13 @@
 
 What is dropped is counted (`drivers.Counters`). The order of samples is judged by the 32-bit counter and the device's
 clock: the next one or a later one is taken (what is missing counts as lost); one of the last 63 that was not seen yet
-comes late, one that was seen is a duplicate, both are dropped; anything else is a head that started anew. Device time is
-unwrapped from its 32 bits of microseconds. A sample after a gap covers one nominal period, not the gap.
+comes late, one that was seen is a duplicate, both are dropped; one whose counter stands still while its time goes on is
+dropped too; anything else is a head that started anew. Device time is unwrapped from its 32 bits of microseconds; where it
+jumps and the counter goes on, the clock was set, and time goes on with the counter. A sample after a gap covers one nominal
+period, not the gap.
 """
 
+from functools import cache
 from importlib.resources import files
 
 import numpy as np
@@ -13,13 +16,13 @@ from numpy.typing import NDArray
 
 from drivers import Counters
 from drivers.can.aiding import is_aiding
-from drivers.can.codec import MessageCodec, load_database
-from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
+from drivers.can.codec import Database, MessageCodec, load_database
+from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray, as_bytes
 from drivers.can.integrity import Protection, protection
 from drivers.can.samples import signed
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, IntArray, Validity
-from nav.kernel import kernel
+from nav.kernel import inline_kernel, kernel
 
 PROTOCOL = 1
 """Version of the message set that this driver reads."""
@@ -29,7 +32,7 @@ ROTOR_VALID = 0x8000
 """Status bit: the rotor angles are there."""
 # What the slow frames have said, a row for each frame: sample period (us), status bits of the built-in test, rotor speeds (Hz),
 # temperatures (degrees Celsius).
-_PERIOD, _BIT, _SPIN, _TEMPERATURE, _SAID = 0, 1, slice(2, 4), slice(4, 7), 7
+_PERIOD, _BIT, _SPIN, _TEMPERATURE, _SAID = 0, 1, 2, 4, 7
 _BUILT_IN = ("bit_g1", "bit_g2", "bit_ax", "bit_ay", "bit_az")
 """Signals of HEAD_BIT, in the order of the status bits that say the same."""
 WINDOW = 64
@@ -49,12 +52,18 @@ _FD_SIGNALS = (
 # State of the tracker.
 _STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN = range(6)
 # Outcomes of the tracker.
-_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS = range(7)
+_SAMPLES, _LOST, _DUPLICATED, _LATE, _CRC, _VERSION, _RESTARTS, _FROZEN, _CLOCK_STEPS, _OUTCOMES = range(10)
 
 
 def head_database_text() -> str:
     """The DBC of the head's message set, the one truth for driver, emulator and firmware."""
     return (files("fixtures") / "can" / "dtg_head.dbc").read_text("cp1252")
+
+
+@cache
+def head_database() -> Database:
+    """The codecs of the head's message set."""
+    return load_database(head_database_text())
 
 
 @kernel
@@ -88,7 +97,17 @@ def _track(
             state[_SEQUENCE], state[_TIME_US] = counter, us
             state[_SEEN] = -1  # one from before the first was never counted as lost
             step_us = float(period)
-        elif delta > 0 and elapsed > 0:
+        elif delta == 0 and elapsed != 0:
+            outcome[_FROZEN] += 1
+            continue
+        elif delta > 0 and (elapsed > 0 or (delta < WINDOW and period > 0)):
+            if (
+                delta < WINDOW
+                and period > 0
+                and (elapsed <= 0 or abs(elapsed - delta * period) > (1 + delta // 8) * period)
+            ):
+                outcome[_CLOCK_STEPS] += 1
+                elapsed = int(delta * period)
             outcome[_LOST] += delta - 1
             state[_SEQUENCE] += delta
             state[_TIME_US] += elapsed
@@ -120,6 +139,70 @@ def _track(
     return n
 
 
+@inline_kernel
+def _is_same(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    same = True
+    for i in range(8):
+        same = same and one[i] == other[i]
+    return same
+
+
+@kernel
+def _fill(
+    count: int,
+    rows: IntArray,
+    values: FloatArray,
+    said: FloatArray,
+    times: IntArray,
+    dtheta: FloatArray,
+    rotor: FloatArray,
+    dvel: FloatArray,
+    validity: IntArray,
+    status: IntArray,
+    spin: FloatArray,
+    temperature: FloatArray,
+    arrivals: IntArray,
+) -> None:
+    """What the accepted samples hold, and what the slow frames had said when they came."""
+    for n in range(count):
+        k = rows[n]
+        there = (int(values[k, _STATUS]) & ROTOR_VALID) != 0
+        for i in range(4):
+            dtheta[n, i] = values[k, _DTHETA + i]
+            rotor[n, i] = values[k, _ROTOR + i] if there else np.nan
+        for i in range(3):
+            dvel[n, i] = values[k, _DVEL + i]
+            temperature[n, i] = said[k, _TEMPERATURE + i]
+        spin[n, 0], spin[n, 1] = said[k, _SPIN], said[k, _SPIN + 1]
+        status[n] = int(values[k, _STATUS]) | int(said[k, _BIT])
+        if said[k, _BIT] != 0.0:
+            validity[n] |= Validity.SENSOR.value
+        arrivals[n] = times[k]
+
+
+@kernel
+def _are_samples(
+    frames: NDArray[np.uint8], can_id: int, now: FloatArray, data: NDArray[np.uint8], said: FloatArray
+) -> bool:
+    """Whether all `frames` (n, 80) are FD samples; then their payloads and what was said lie in `data` and `said`."""
+    for k in range(frames.shape[0]):
+        found = frames[k, 8] | frames[k, 9] << 8 | frames[k, 10] << 16 | frames[k, 11] << 24
+        if found != can_id or frames[k, 12] != 64 or frames[k, 13] & FDF == 0:
+            return False
+        for i in range(64):
+            data[k, i] = frames[k, 16 + i]
+        for i in range(_SAID):
+            said[k, i] = now[i]
+    return True
+
+
+@kernel
+def _reorder(raw: FloatArray, columns: IntArray, values: FloatArray) -> None:
+    for k in range(raw.shape[0]):
+        for i in range(columns.shape[0]):
+            values[k, i] = raw[k, columns[i]]
+
+
 @kernel
 def _join(
     kind: IntArray,
@@ -129,23 +212,25 @@ def _join(
     joined: NDArray[np.uint8],
     last: IntArray,
 ) -> tuple[int, int]:
-    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames)."""
+    """Collect the six classic frames of a sample; returns (complete samples, duplicate frames).
+
+    A head sends them in rising order. One that comes behind a later one begins another sample with the same four bits of
+    counter: what is open lacks it, and would be completed with what is not its own.
+    """
     n = duplicates = 0
     for k in range(kind.shape[0]):
         if kind[k] < 0:
             continue
         number = data[k, 1] & 0x0F
         bit = 1 << kind[k]
-        if number != state[0]:
+        is_held = state[1] & bit or (
+            state[0] < 0 and kind[k] == state[2]
+        )  # also the one that completed the last sample
+        if is_held and (number == state[0] or state[0] < 0) and _is_same(partial[kind[k]], data[k]):
+            duplicates += 1
+            continue
+        if number != state[0] or state[1] >= bit:
             state[0], state[1] = number, 0
-        if state[1] & bit:
-            again = True
-            for i in range(8):
-                again = again and partial[kind[k], i] == data[k, i]
-            if again:
-                duplicates += 1
-                continue
-            state[1] = 0  # the same number a whole turn of it later: what was begun is never completed
         state[1] |= bit
         for i in range(8):
             partial[kind[k], i] = data[k, i]
@@ -155,7 +240,7 @@ def _join(
                     joined[n, j, i] = partial[j, i]
             last[n] = k
             n += 1
-            state[0], state[1] = -1, 0
+            state[0], state[1], state[2] = -1, 0, kind[k]
     return n, duplicates
 
 
@@ -163,7 +248,7 @@ class DtgHead:
     """See the module; satisfies `drivers.FrameDriver`."""
 
     def __init__(self) -> None:
-        database = load_database(head_database_text())
+        database = head_database()
         self._sample = database["HEAD_SAMPLE"]
         self._classic = [database[name] for name in CLASSIC]
         self._slow = {database[name].can_id: database[name] for name in SLOW}
@@ -182,9 +267,9 @@ class DtgHead:
         self._now = np.array([0.0, 0.0, *[np.nan] * 5])
         """What the slow frames have said so far."""
         self._state = np.zeros(6, np.int64)
-        self._outcome = np.zeros(7, np.int64)
+        self._outcome = np.zeros(_OUTCOMES, np.int64)
         self._partial = np.zeros((6, 8), np.uint8)
-        self._partial_state = np.array([-1, 0], np.int64)
+        self._partial_state = np.array([-1, 0, -1], np.int64)
         self._arrivals: IntArray = np.zeros(0, np.int64)
         self._room(1024)
 
@@ -194,7 +279,8 @@ class DtgHead:
         self._raw = np.zeros((n, len(self._sample.signals)))
         self._values = np.zeros((n, _COLUMNS))
         self._good = np.zeros(n, np.bool_)
-        self._rows = np.zeros(n, np.int64)
+        self._rows, self._times = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        self._views: dict[int, HeadIncrements] = {}
         self._said = np.zeros((n, _SAID))
 
     def identity(self) -> dict[str, object]:
@@ -211,13 +297,12 @@ class DtgHead:
         if n > len(self._batch):
             self._room(2 * n)
         self.counters.frames += n
+        said = self._said[:n]
+        if _are_samples(as_bytes(batch), self._sample.can_id, self._now, self._data, said):
+            return self._samples(n, batch["time_ns"], said)
         ids = batch["can_id"]
         is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
-        said = self._said[:n]
         said[:] = self._now
-        if is_sample.all():
-            self._data[:n] = batch["data"]
-            return self._samples(n, batch["time_ns"], said)
         self._others(batch, np.flatnonzero(~(is_sample | is_aiding(ids))), said)
         chosen = batch[is_sample]
         if len(chosen):
@@ -229,44 +314,27 @@ class DtgHead:
         data = self._data[:n]
         self._protection["HEAD_SAMPLE"].check(data, self._good[:n])
         self._sample.decode(data, self._raw[:n])
-        self._values[:n] = self._raw[:n, self._columns]
+        _reorder(self._raw[:n], self._columns, self._values)
         return self._accept(n, times, said)
 
     def _accept(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
         batch, values = self._batch, self._values[:n]
-        count = _track(
-            values,
-            self._good[:n],
-            said,
-            self._state,
-            self._outcome,
-            batch.time,
-            batch.step,
-            batch.sequence,
-            batch.validity,
-            self._rows,
-        )
-        rows = self._rows[:count]
-        result = batch.rows(0, count)
-        kept = values[rows]
-        result.dtheta[:] = kept[:, _DTHETA : _DTHETA + 4]
-        result.rotor[:] = kept[:, _ROTOR : _ROTOR + 4]
-        result.dvel[:] = kept[:, _DVEL : _DVEL + 3]
-        invalid = (kept[:, _STATUS].astype(np.int64) & ROTOR_VALID) == 0
-        if invalid.any():
-            result.rotor[invalid] = np.nan
-        said = said[rows]
-        result.spin[:], result.temperature[:] = said[:, _SPIN], said[:, _TEMPERATURE]
-        result.status[:] = kept[:, _STATUS].astype(np.int64) | said[:, _BIT].astype(np.int64)
-        result.validity[said[:, _BIT] != 0.0] |= Validity.SENSOR.value
-        self._arrivals = times[rows]
+        samples = batch.time, batch.step, batch.sequence, batch.validity
+        count = _track(values, self._good[:n], said, self._state, self._outcome, *samples, self._rows)
+        sensed = batch.dtheta, batch.rotor, batch.dvel, batch.validity, batch.status, batch.spin, batch.temperature
+        _fill(count, self._rows, values, said, times, *sensed, self._times)
+        result = self._views.get(count)
+        if result is None:
+            result = self._views[count] = batch.rows(0, count)
+        self._arrivals = self._times[:count]
         counters, outcome = self.counters, self._outcome
         counters.samples, counters.lost, counters.late = (
             int(outcome[_SAMPLES]),
             int(outcome[_LOST]),
             int(outcome[_LATE]),
         )
-        counters.restarts = int(outcome[_RESTARTS])
+        counters.restarts, counters.frozen = int(outcome[_RESTARTS]), int(outcome[_FROZEN])
+        counters.clock_steps = int(outcome[_CLOCK_STEPS])
         counters.duplicated += int(outcome[_DUPLICATED])
         counters.crc_errors += int(outcome[_CRC])
         counters.version_errors += int(outcome[_VERSION])
@@ -307,9 +375,9 @@ class DtgHead:
         if codec.name == "HEAD_BIT":
             self._now[_BIT] = sum(1 << k for k, name in enumerate(_BUILT_IN) if said[name])
         if codec.name == "HEAD_ROTOR":
-            self._now[_SPIN] = said["rotor_speed_g1"], said["rotor_speed_g2"]
+            self._now[_SPIN : _SPIN + 2] = said["rotor_speed_g1"], said["rotor_speed_g2"]
         if codec.name == "HEAD_TEMPERATURE":
-            self._now[_TEMPERATURE] = [said[f"temperature_{part}"] for part in ("g1", "g2", "acc")]
+            self._now[_TEMPERATURE:] = [said[f"temperature_{part}"] for part in ("g1", "g2", "acc")]
         self._identity.update({k: v for k, v in said.items() if k not in {"crc8", "e2e_counter"}})
 
     def _classic_samples(self, batch: FrameArray, said: FloatArray) -> HeadIncrements:

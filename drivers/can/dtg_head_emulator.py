@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.can.codec import load_database
-from drivers.can.dtg_head import CLASSIC, PROTOCOL, ROTOR_VALID, SLOW, head_database_text
+from drivers.can.dtg_head import CLASSIC, PROTOCOL, ROTOR_VALID, SLOW, head_database
 from drivers.can.frames import BRS, FDF, FrameArray, frames
 from drivers.can.integrity import Protection, protection
 from nav.errors import HilError
@@ -71,7 +70,7 @@ class HeadEncoder:
         if not 0 < period_us < 1 << 16:
             raise HilError(f"the head's sample period must be 1..65535 us, not {period_us}")
         self._layout: Literal["fd", "classic"] = layout
-        database = load_database(head_database_text())
+        database = head_database()
         names = ("HEAD_SAMPLE",) if layout == "fd" else CLASSIC
         self._codecs = [database[name] for name in names]
         self._slow = [database[name] for name in SLOW]

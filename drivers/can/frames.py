@@ -35,3 +35,8 @@ FDF = 0x04
 def frames(n: int) -> FrameArray:
     """Room for `n` frames, zeroed."""
     return np.zeros(n, FRAME)
+
+
+def as_bytes(batch: FrameArray) -> NDArray[np.uint8]:
+    """The frames (n,) as bytes (n, 80), for kernels: a view where `batch` is contiguous."""
+    return np.ascontiguousarray(batch).view(np.uint8).reshape(len(batch), FRAME.itemsize)

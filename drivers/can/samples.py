@@ -6,6 +6,8 @@ a sample is placed by the board's counter where it sends one, else by its time i
 
 - the next one or a later one is taken, what is missing between counts as lost;
 - one of the last 63 that was not seen yet comes late, one that was seen is a duplicate; both are dropped;
+- by a counter, one that stands still while time goes on is dropped; where it goes on by one and time jumps, the clock was set,
+  and time goes on by a period;
 - anything else is a board that started anew, and the period is learnt again.
 
 A rate is that at the sample's time: the increment is the mean of both ends times the step; after a gap, the rate times one
@@ -33,7 +35,7 @@ TICKS, NUMBER, BAD, TURN, PUSH, TURN_IS, PUSH_IS, RAW = 0, 1, 2, 3, 6, 9, 10, 11
 RATE, MEAN_RATE, INCREMENT = 0, 1, 2
 
 _LEARNT, _LAST_TICKS, _LAST_NUMBER, _TIME, _SEQUENCE, _SEEN, _PERIOD, _UNIT, _TURN_HELD, _PUSH_HELD = range(10)
-_SAMPLES, _LOST, _DUPLICATED, _LATE, _RESTARTS = range(5)
+_SAMPLES, _LOST, _DUPLICATED, _LATE, _RESTARTS, _FROZEN, _CLOCK_STEPS, _OUTCOMES = range(8)
 
 
 @inline_kernel
@@ -117,6 +119,12 @@ def _take(
         if state[_UNIT] > 0 and number >= 0:
             delta = int(np.rint(signed(number - state[_LAST_NUMBER], 16) / state[_UNIT]))
             fits = abs(elapsed - delta * period) <= 0.5 * period * max(abs(delta), 1)
+            if delta == 0 and not fits and abs(elapsed) * tick_s <= LONGEST_S:
+                outcome[_FROZEN] += 1
+                continue
+            if delta == 1 and not fits:
+                outcome[_CLOCK_STEPS] += 1
+                elapsed, fits = period, True
         else:
             delta = int(np.rint(elapsed / period))
         fits = fits and elapsed * tick_s <= LONGEST_S
@@ -181,7 +189,7 @@ class Samples:
     def __init__(self, counters: Counters, tick_s: float, grid_s: float = 0.0) -> None:
         self._counters, self._tick_s, self._grid = counters, tick_s, round(grid_s / tick_s)
         self._learnt, self._before = np.zeros((2, LEARN), np.int64), np.zeros(6)
-        self._state, self._outcome = np.zeros(10, np.int64), np.zeros(5, np.int64)
+        self._state, self._outcome = np.zeros(10, np.int64), np.zeros(_OUTCOMES, np.int64)
         self._state[_LEARNT] = -1
         self._room(256)
 
@@ -216,7 +224,8 @@ class Samples:
             self._rows,
         )
         counters.samples, counters.lost, counters.late = (int(outcome[i]) for i in (_SAMPLES, _LOST, _LATE))
-        counters.restarts = int(outcome[_RESTARTS])
+        counters.restarts, counters.frozen = int(outcome[_RESTARTS]), int(outcome[_FROZEN])
+        counters.clock_steps = int(outcome[_CLOCK_STEPS])
         counters.duplicated += int(outcome[_DUPLICATED])
         outcome[_DUPLICATED] = 0
         return batch.rows(0, n), self._rows[:n]

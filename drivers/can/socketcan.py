@@ -1,8 +1,9 @@
 """SocketCAN without python-can: many frames a system call, kernel time stamps in integer nanoseconds, drops counted.
 
 `recvmmsg` fills the records of a batch in place (`FRAME` is ``struct canfd_frame`` behind a time stamp). The kernel stamps
-each frame on arrival (SO_TIMESTAMPNS) and counts what did not fit into the socket's buffer (SO_RXQ_OVFL). An interface
-that goes down, or away, is reopened when it is back.
+each frame on arrival (SO_TIMESTAMPNS), hands on the adapter's own stamp where it has one (SO_TIMESTAMPING, see
+:mod:`drivers.can.stamps`), and counts what did not fit into the socket's buffer (SO_RXQ_OVFL). An interface that goes down, or
+away, is reopened when it is back.
 """
 
 import contextlib
@@ -11,12 +12,15 @@ import errno
 import os
 import select
 import socket
+import struct
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from drivers.can.frames import FDF, FRAME, FrameArray
+from drivers.can.frames import EFF, FDF, FRAME, FrameArray
+from drivers.can.stamps import AdapterClock
 from nav.errors import HilError
 
 BURST = 64
@@ -25,18 +29,25 @@ RECEIVE_BUFFER = 8 << 20
 REOPEN_S = 0.5
 """Time between tries to reopen an interface that failed."""
 _CAN_MTU, _CANFD_MTU = 16, 72
-_SO_TIMESTAMPNS, _SO_RXQ_OVFL, _SO_RCVBUFFORCE, _CAN_RAW_ERR_FILTER = 35, 40, 33, 2
+_SECOND = 1_000_000_000
+_NANOSECONDS = np.array([_SECOND, 1])
+_SO_TIMESTAMPNS, _SO_TIMESTAMPING, _SO_RXQ_OVFL, _SO_RCVBUFFORCE, _CAN_RAW_ERR_FILTER = 35, 37, 40, 33, 2
+_STAMPS = 1 << 2 | 1 << 4 | 1 << 6
+"""SOF_TIMESTAMPING: have the adapter stamp; tell the kernel's stamp, tell the adapter's as it is."""
 _CONTROL = np.dtype(
     [
         ("stamp_head", "<i8", 2),  # cmsg_len; level and type
         ("seconds", "<i8"),
         ("nanoseconds", "<i8"),
+        ("stamps_head", "<i8", 2),
+        ("stamps", "<i8", (3, 2)),  # the kernel's, one that is no longer used, the adapter's; zero: none
         ("drop_head", "<i8", 2),
         ("dropped", "<u4"),
         ("pad", "<u4"),
     ]
 )
-_STAMP_LENGTH, _DROP_LENGTH = 32, 20
+_STAMP_LENGTH = 96
+"""Bytes of both kinds of stamps: what is longer counts drops too."""
 
 
 class _IoVector(ctypes.Structure):
@@ -63,14 +74,24 @@ _libc = ctypes.CDLL(None, use_errno=True)
 class SocketCanPort:
     """One raw socket on a CAN interface; satisfies `drivers.can.bus.Port`.
 
+    Parameters
+    ----------
+    interface : str
+        As ``can0``.
+    listen : bool
+        False for a pure sender.
+    filters : sequence of (int, int)
+        Identifiers and masks, with the flag EFF: the kernel keeps back what fits none of them. Empty: all frames come.
+
     Raises
     ------
     HilError
         No SocketCAN, no such interface, or it is down; the message says how to mend it.
     """
 
-    def __init__(self, interface: str, *, listen: bool = True) -> None:
+    def __init__(self, interface: str, *, listen: bool = True, filters: Sequence[tuple[int, int]] = ()) -> None:
         self.interface = interface
+        self._filters = b"".join(struct.pack("=II", *pair) for pair in filters)
         self._listen = listen
         self.dropped = 0
         """Frames that the interface did not take."""
@@ -78,7 +99,10 @@ class SocketCanPort:
         """Frames that the kernel dropped because our buffer was full."""
         self.failures = 0
         """Times the interface failed."""
+        self.trouble = ""
+        """Why it cannot be used now, with the command that mends it."""
         self._overflow_base = 0
+        self._clock = AdapterClock()
         self._retry = 0.0
         self._frames: FrameArray = np.zeros(BURST, FRAME)
         self._control = np.zeros(BURST, _CONTROL)
@@ -102,30 +126,37 @@ class SocketCanPort:
         try:
             sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except (OSError, AttributeError) as error:
-            raise HilError(f"bus socketcan:{self.interface}: {explain(self.interface, error)}") from error
+            raise HilError(self._why(error)) from error
         try:
             sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FD_FRAMES, 1)
             if self._listen:
                 sock.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, 0x1FFFFFFF)
+                if self._filters:
+                    sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
             else:
                 sock.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
             for option in (socket.SO_RCVBUF, _SO_RCVBUFFORCE):
                 with contextlib.suppress(OSError):
                     sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
             sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPING, _STAMPS)
             sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
             sock.bind((self.interface,))
             if not _is_up(self.interface):
                 raise OSError(errno.ENETDOWN, os.strerror(errno.ENETDOWN))
         except OSError as error:
             sock.close()
-            raise HilError(f"bus socketcan:{self.interface}: {explain(self.interface, error)}") from error
+            raise HilError(self._why(error)) from error
         sock.setblocking(False)
         self._overflow_base = self.overflowed
         return sock
 
-    def _failed(self) -> None:
+    def _why(self, error: Exception) -> str:
+        return f"bus socketcan:{self.interface}: {explain(self.interface, error)}"
+
+    def _failed(self, code: int) -> None:
         self.failures += 1
+        self.trouble = self._why(OSError(code, os.strerror(code)))
         if self._socket is not None:
             self._socket.close()
         self._socket = None
@@ -135,7 +166,9 @@ class SocketCanPort:
         if self._socket is None and time.monotonic() >= self._retry:
             try:
                 self._socket = self._open()
-            except HilError:
+                self.trouble = ""
+            except HilError as error:
+                self.trouble = str(error)
                 self._retry = time.monotonic() + REOPEN_S
         return self._socket
 
@@ -167,10 +200,11 @@ class SocketCanPort:
         if got <= 0:
             code = ctypes.get_errno() if got < 0 else 0
             if code not in {0, errno.EAGAIN, errno.EINTR}:
-                self._failed()
+                self._failed(code)
             return 0
         taken, control = self._frames[:got], self._control[:got]
-        taken["time_ns"] = control["seconds"] * 1_000_000_000 + control["nanoseconds"]
+        kernel, adapter = control["seconds"] * _SECOND + control["nanoseconds"], control["stamps"][:, 2]
+        taken["time_ns"] = self._clock.arrivals(kernel, adapter @ _NANOSECONDS) if adapter.any() else kernel
         taken["flags"] = np.where(self._lengths[:got] == _CANFD_MTU, taken["flags"] | FDF, 0)
         taken["reserved"] = 0
         if self._control_lengths[got - 1] > _STAMP_LENGTH:
@@ -199,7 +233,7 @@ class SocketCanPort:
                     time.sleep(0.001)
                     continue
                 if error.errno in {errno.ENETDOWN, errno.ENODEV, errno.ENXIO}:
-                    self._failed()
+                    self._failed(error.errno)
                 break
         self.dropped += 1
 
@@ -208,6 +242,28 @@ class SocketCanPort:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+def parse_filters(text: str) -> list[tuple[int, int]]:
+    """Identifiers and masks of ``120:7F0,18F00000:1FFF0000``: hexadecimal, eight digits for those of 29 bits, as candump has it.
+
+    Raises
+    ------
+    HilError
+        The text is anything else.
+    """
+    found = []
+    for part in text.split(","):
+        names = part.split(":")
+        try:
+            number, mask = (int(name, 16) for name in names)
+        except ValueError:
+            number, mask = -1, -1
+        extended = len(names[0]) == 8
+        if min(number, mask) < 0 or max(number, mask) > (0x1FFFFFFF if extended else 0x7FF):
+            raise HilError(f"filter {part!r}: expected ID:MASK as 120:7F0, or with eight digits 18F00000:1FFF0000")
+        found.append((number | EFF, mask | EFF) if extended else (number, mask | EFF))
+    return found
 
 
 def _is_up(interface: str) -> bool:

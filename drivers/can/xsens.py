@@ -8,6 +8,7 @@ comes, else from DeltaQ: above 32 Hz one step of the quaternion is more than one
 The board's axes are forward, left, up; they are turned into forward, right, down here. See `docs/boards/xsens-can.md`.
 """
 
+from functools import cache
 from importlib.resources import files
 
 import numpy as np
@@ -47,6 +48,7 @@ KINDS = {
 }
 
 
+@cache
 def xsens_database() -> Database:
     """The part of the vendor's message set that is read here."""
     return load_database((files("fixtures") / "can" / "xsens_mti600.dbc").read_text("cp1252"))

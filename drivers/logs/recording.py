@@ -1,10 +1,12 @@
 """Our own recording: every frame as it came in, with its time, and the events that the navigation depends on.
 
 Layout: the magic line, a header (length, CRC-32, JSON), then blocks of whole `FRAME` records, each block with its count
-and CRC-32. A block is written at least every `FLUSH_S`, so that a killed process loses no more than that. A record whose
-``reserved[0]`` is `EVENT` is no frame but an event of the loop, in its place among the frames.
+and CRC-32. A block is written at least every `FLUSH_S`, so that a killed process loses no more than that. A block that the
+disk does not take is taken back whole: what was recorded before stays readable, and recording goes on when there is room. A
+record whose ``reserved[0]`` is `EVENT` is no frame but an event of the loop, in its place among the frames.
 """
 
+import contextlib
 import json
 import struct
 import time
@@ -20,8 +22,12 @@ from nav.errors import HilError
 
 MAGIC = b"DTGHIL recording 1\n"
 FLUSH_S = 0.05
+RETRY_S = 0.5
+"""Time between tries to write on a disk that was full."""
 BLOCK = 4096
 """Most frames in one block."""
+LONGEST_HEADER = 1 << 24
+"""Bytes: a longer header is damage, and is not read."""
 EVENT = 1
 """Value of ``reserved[0]`` that marks an event record."""
 SILENCE = 1
@@ -60,18 +66,23 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, header: dict[str, Any]) -> None:
+        self.path = path
+        text = json.dumps(header).encode()
         try:
-            self._file: BinaryIO = path.open("wb")
+            self._file = path.open("wb", buffering=0)
+            self._end = self._put(MAGIC + _HEAD.pack(len(text), zlib.crc32(text)) + text)
         except OSError as error:
             raise HilError(f"recording {path}: {error.strerror}") from error
-        text = json.dumps(header).encode()
-        self._file.write(MAGIC + _HEAD.pack(len(text), zlib.crc32(text)) + text)
-        self._file.flush()
         self._block = frames(BLOCK)
         self._filled = 0
         self._flushed = time.monotonic()
+        self._retry = 0.0
         self.written = 0
         """Records written."""
+        self.lost = 0
+        """Records that the disk did not take."""
+        self.problem = ""
+        """Why the disk does not take what comes now; empty while it does."""
 
     def write(self, batch: FrameArray) -> None:
         """Append `batch`; flushes by count and by time."""
@@ -89,12 +100,31 @@ class RecordingWriter:
     def flush(self) -> None:
         """Write what is buffered as one block."""
         self._flushed = time.monotonic()
-        if self._filled:
-            data = self._block[: self._filled].tobytes()
-            self._file.write(_BLOCK_HEAD.pack(b"BLK1", self._filled, zlib.crc32(data)) + data)
-            self._file.flush()
-            self.written += self._filled
-            self._filled = 0
+        count, self._filled = self._filled, 0
+        if not count:
+            return
+        if self.problem and self._flushed < self._retry:
+            self.lost += count
+            return
+        data = self._block[:count].tobytes()
+        try:
+            self._end += self._put(_BLOCK_HEAD.pack(b"BLK1", count, zlib.crc32(data)) + data)
+            self.written += count
+            self.problem = ""
+        except OSError as error:
+            self.lost += count
+            self._retry = self._flushed + RETRY_S
+            self.problem = f"recording {self.path}: {error.strerror}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._end)
+            self._file.seek(self._end)
+
+    def _put(self, data: bytes) -> int:
+        """Write all of `data`; its length."""
+        rest = memoryview(data)
+        while rest:
+            rest = rest[self._file.write(rest) :]
+        return len(data)
 
     def close(self) -> None:
         """Flush and close."""
@@ -144,11 +174,12 @@ class RecordingReader:
             file.close()
             raise HilError(f"recording {path}: not a recording of ours at offset 0")
         length, crc = _HEAD.unpack(start[len(MAGIC) :])
-        text = file.read(length)
-        if len(text) != length or zlib.crc32(text) != crc:
+        text = file.read(min(length, LONGEST_HEADER))
+        header = _header(text) if len(text) == length and zlib.crc32(text) == crc else None
+        if header is None:
             file.close()
             raise HilError(f"recording {path}: damaged header at offset {len(MAGIC)}")
-        return RecordingReader(path, json.loads(text), "", file, file.tell())
+        return RecordingReader(path, header, "", file, file.tell())
 
     def read(self) -> FrameArray:
         """The next block; empty at the end (see `problem`)."""
@@ -168,3 +199,12 @@ class RecordingReader:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _header(text: bytes) -> dict[str, Any] | None:
+    """The header, whose check is right; None where it says nothing that a writer of ours says."""
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return header if isinstance(header, dict) else None

@@ -61,12 +61,12 @@ def read_ulog(path: Path) -> ImuLog:
     except Exception as error:  # pyulog raises whatever the bytes provoke
         raise HilError(f"log {path}: not a readable ULog: {error}") from error
     topics = {(topic.name, topic.multi_id): topic.data for topic in log.data_list}
-    for name in ("sensor_combined", "vehicle_attitude"):
-        if (name, 0) not in topics or len(topics[name, 0]["timestamp"]) < 2:
-            raise HilError(f"log {path}: it has no topic {name} with samples")
-    imu, attitude = topics["sensor_combined", 0], topics["vehicle_attitude", 0]
-    said = {name: float(log.initial_parameters.get(name, value)) for name, value in _DEFAULTS.items()}
+    said = {name: _stated(log.initial_parameters.get(name), value) for name, value in _DEFAULTS.items()}
     try:
+        for name in ("sensor_combined", "vehicle_attitude"):
+            if (name, 0) not in topics or len(topics[name, 0]["timestamp"]) < 2:
+                raise HilError(f"it has no topic {name} with samples")
+        imu, attitude = topics["sensor_combined", 0], topics["vehicle_attitude", 0]
         return make_log(
             _times(imu),
             _columns(imu, "gyro_rad", 3),
@@ -76,8 +76,15 @@ def read_ulog(path: Path) -> ImuLog:
             list(_measured(topics, said)),
             math.radians(said["EKF2_MAG_DECL"]),
         )
+    except KeyError as error:
+        raise HilError(f"log {path}: a topic lacks its column {error}") from error
     except HilError as error:
         raise HilError(f"log {path}: {error}") from error
+
+
+def _stated(value: object, default: float) -> float:
+    """A parameter of the log, the default where it is no number."""
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else default
 
 
 def _times(data: _Data) -> IntArray:

@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.mavlink.messages import DIAGONAL
 from drivers.mavlink.solution import Home, Undulation, geodetic
-from nav.aiding import RELAYED, Kind, aiding
+from nav.aiding import OPERATOR, RECEIVERS, RELAYED, Kind, aiding
 from nav.errors import HilError
 from nav.rotation import quaternion_from_euler
 
@@ -29,8 +29,7 @@ SMALLEST_M, SMALLEST_MS, SMALLEST_RAD = 0.01, 0.01, 1e-4
 """No message is believed to be better than this."""
 FARTHEST_M, FASTEST_MS, LONGEST_S = 1e5, 2000.0, 1.0
 
-RECEIVERS = 16
-VISION, MASTER, OPERATOR = RELAYED + RECEIVERS, RELAYED + RECEIVERS + 1, RELAYED + RECEIVERS + 2
+VISION, MASTER = RELAYED + RECEIVERS, RELAYED + RECEIVERS + 1
 """Sources of rows: a receiver is `RELAYED` + its number, below `RECEIVERS`."""
 
 _FIXES = (

@@ -12,36 +12,27 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
+from drivers.logs.tlog import TlogWriter
 from drivers.mavlink.commands import answer
+from drivers.mavlink.events import PACE_S, Happened, changes
+from drivers.mavlink.extra import CurrentEventSequence, Event
+from drivers.mavlink.files import FileServer
 from drivers.mavlink.link import Link
 from drivers.mavlink.messages import KINDS, Kind, Message
-from drivers.mavlink.station import Station
+from drivers.mavlink.options import LinkOptions
+from drivers.mavlink.signing import Signer
+from drivers.mavlink.station import SEVERITIES, Station
 from nav.state import Health, Mode
 
-_ANNOUNCE_S = 0.5
-"""Shortest time between two announcements of mode or health: a flapping flag may not fill the link."""
+_EVENTS_S = 5.0
+"""How often the number of the newest event is told, for clients that have missed it."""
 _AGAIN_S = 0.5
 """When to look again at a link without a peer."""
 _TEXT = 50
 """Characters of one STATUSTEXT."""
+_LONGEST_GAP = 128
+"""A gap in a sequence as long as this is a sender that began anew, or one that repeats itself."""
 _MARKERS = (mav.PROTOCOL_MARKER_V1, mav.PROTOCOL_MARKER_V2)
-
-_MODE_TEXT = {
-    Mode.INIT: "Waiting for the sensor",
-    Mode.ALIGN: "Aligning: keep still",
-    Mode.NAVIGATE: "Navigating",
-    Mode.DEGRADED: "Navigation degraded",
-}
-_HEALTH_TEXT = {
-    Health.SILENT: (mav.MAV_SEVERITY_ERROR, "No samples from the sensor"),
-    Health.BRIDGED: (mav.MAV_SEVERITY_WARNING, "A gap in the samples was bridged"),
-    Health.SENSOR: (mav.MAV_SEVERITY_ERROR, "The sensor reports a fault"),
-    Health.MOVING: (mav.MAV_SEVERITY_NOTICE, "Alignment waits: the vehicle moves"),
-    Health.UNITS: (mav.MAV_SEVERITY_ERROR, "Specific force at rest is not 1 g"),
-    Health.RATE_TOO_SMALL: (mav.MAV_SEVERITY_WARNING, "Cannot find north: heading must be given"),
-    Health.SPARE: (mav.MAV_SEVERITY_WARNING, "A redundant instrument has failed"),
-    Health.UNAIDED: (mav.MAV_SEVERITY_NOTICE, "Position is not aided and drifts"),
-}
 
 
 @dataclass(slots=True)
@@ -64,27 +55,63 @@ class Endpoint:
         Shared with the other links.
     link : Link
         Owned and closed by the caller.
+    options : LinkOptions, optional
+        What is different on this link.
+    signer : Signer, optional
+        Signs and checks; without it nothing is signed and nothing asked for.
+    log : TlogWriter, optional
+        Takes every frame that is sent, and every one received that is not refused.
+    number : int
+        Of the link, for signatures.
     """
 
-    def __init__(self, station: Station, link: Link) -> None:
+    def __init__(
+        self,
+        station: Station,
+        link: Link,
+        options: LinkOptions | None = None,
+        signer: Signer | None = None,
+        log: TlogWriter | None = None,
+        number: int = 0,
+    ) -> None:
         self.station = station
         self.link = link
+        self.options = options or LinkOptions(link.url)
+        self.log = log
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        """Messages whose signature was missing or wrong, by reason."""
+        self.lost = 0
+        """Messages missing in the sequences of the senders."""
         self.bad_data = 0
         """Stretches of bytes that were no message."""
         self.dropped = 0
         """Messages that a link with a peer did not take."""
         self.waits = False
         """Whether something is due that goes out with the next solution."""
-        self._mav = mav.MAVLink(None, station.identity.system_id, station.identity.component_id)
-        self._mav.robust_parsing = True
-        self._streams = {name: _Stream(kind, station.interval_s(name)) for name, kind in KINDS.items()}
+        self._signer, self._number = signer if self.options.sign else None, number
+        self._packer = mav.MAVLink(None, station.identity.system_id, station.identity.component_id)
+        self._parser = mav.MAVLink(None)
+        self._parser.robust_parsing = True
+        self._sequences: dict[tuple[int, int], int] = {}
+        self._streams = {name: _Stream(kind, self.default_s(name)) for name, kind in KINDS.items()}
         self._announced = (Mode.INIT, Health.GOOD)
         self._announce_s = -math.inf
         self._told = station.noted
+        self.files = FileServer(station.files)
+        self.wants_events = False
+        """Whether a client has shown that it knows events: to one that does not, they look like losses."""
+        self._event = station.events.count
+        self._event_s = -math.inf
         self._long_texts = 0
-        station.on_rate.append(lambda name: self.set_interval(name, station.interval_s(name)))
+        station.on_rate.append(self._renew)
+        station.on_home.append(self._send_home)
+
+    def close(self) -> None:
+        """Take part in the station no longer."""
+        self.station.on_rate.remove(self._renew)
+        self.station.on_home.remove(self._send_home)
 
     def poll(self, now_s: float) -> float:
         """Read what has arrived, answer it, send what is due; returns when to come again at the latest."""
@@ -93,19 +120,33 @@ class Endpoint:
         for message in self._parsed(data) if data else ():
             self._take(message)
         if not self.link.ready():
-            self.waits, self._told = False, self.station.noted
+            self.waits, self._told, self._event = False, self.station.noted, self.station.events.count
             return now_s + _AGAIN_S
         self._announce(now_s)
+        if self.wants_events:
+            self._send_events(now_s)
         return self._send_due(now_s)
 
     def send(self, message: Message) -> None:
         """Send a message now."""
-        frame = bytes(message.pack(self._mav))
-        self._mav.seq = (self._mav.seq + 1) % 256
-        if self.link.send(frame):
-            self.sent[message.get_type()] += 1
-        else:
+        if self._signer is not None:
+            self._signer.sign(self._packer, self._number)
+        frame = bytes(message.pack(self._packer))
+        self._packer.seq = (self._packer.seq + 1) % 256
+        name = message.get_type()
+        if not self.link.send(frame):
             self.dropped += 1
+            return
+        self.sent[name] += 1
+        if self.log is not None:
+            self.log.write(frame)
+        if name == "ATTITUDE":
+            self.station.on_attitude()
+
+    def say(self, severity: str, text: str) -> None:
+        """Have something said at once, whatever else waits to be told."""
+        if self.link.ready():
+            self._say(SEVERITIES[severity], text)
 
     def send_now(self, name: str) -> bool:
         """Send the newest message `name`; False when there is nothing to say yet."""
@@ -114,9 +155,45 @@ class Endpoint:
             self.send(message)
         return message is not None
 
+    def _send_home(self) -> None:
+        if self.allows("HOME_POSITION"):
+            self.send_now("HOME_POSITION")
+
+    def send_event(self, happened: Happened) -> None:
+        """Send an event."""
+        level = happened.kind.severity << 4 | happened.kind.severity
+        numbers = happened.kind.number, happened.time_ms % 2**32, happened.sequence
+        self.send(Event(0, 0, *numbers, level, [0] * 40))
+
+    def _send_events(self, now_s: float) -> None:
+        events = self.station.events
+        for happened in events.since(self._event):
+            self.send_event(happened)
+        self._event = events.count
+        if events.count and now_s >= self._event_s:
+            self.send(CurrentEventSequence(events.newest, 0))
+            self._event_s = now_s + _EVENTS_S
+
     def interval_s(self, name: str) -> float:
         """Interval of message `name` on this link, s; 0 when it is off."""
         return self._streams[name].interval_s
+
+    def default_s(self, name: str) -> float:
+        """Interval that message `name` has on this link unless a ground station asks for another, s; 0 when it is off."""
+        if not self.allows(name):
+            return 0.0
+        rate_hz = self.options.rates_hz.get(name)
+        if rate_hz is None:
+            return self.station.interval_s(name)
+        return 1.0 / rate_hz if rate_hz > 0.0 else 0.0
+
+    def allows(self, name: str) -> bool:
+        """Whether message `name` of the table may go out here."""
+        return not self.options.only or name in self.options.only or name == "HEARTBEAT"
+
+    def _renew(self, name: str) -> None:
+        if name not in self.options.rates_hz:
+            self.set_interval(name, self.default_s(name))
 
     def set_interval(self, name: str, interval_s: float) -> None:
         """Set the interval of message `name` on this link, s; 0 switches it off."""
@@ -147,7 +224,7 @@ class Endpoint:
 
     def _parsed(self, data: bytes) -> Iterator[Any]:
         """Messages in `data`; after a frame that was none, the search goes on at its second byte."""
-        parser = self._mav
+        parser = self._parser
         if self.link.datagrams and data[0] in _MARKERS and parser.buf:
             parser.buf, parser.buf_index = bytearray(), 0  # the rest of that frame will never come
             self.bad_data += 1
@@ -166,12 +243,32 @@ class Endpoint:
 
     def _take(self, message: Any) -> None:
         identity = self.station.identity
-        if (message.get_srcSystem(), message.get_srcComponent()) == (identity.system_id, identity.component_id):
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        if sender == (identity.system_id, identity.component_id):
             return  # our own, looped back
-        self.received[message.get_type()] += 1
+        if self._signer is not None and (reason := self._signer.refusal(message)):
+            if not self.refused[reason]:
+                self.station.tell("warning", f"MAVLink from system {sender[0]} is refused: {reason}")
+            self.refused[reason] += 1
+            return
+        self.link.heard()
+        self._count(sender, message)
+        if not self.options.hear:
+            return
         if self.station.intake is not None:
             self.station.intake.message(message, self.station)
         answer(message, self)
+
+    def _count(self, sender: tuple[int, int], message: Any) -> None:
+        name = message.get_type()
+        self.received["UNKNOWN" if name.startswith("UNKNOWN_") else name] += 1  # there are 2^24 numbers of messages
+        number, last = message.get_seq(), self._sequences.get(sender)
+        self._sequences[sender] = number
+        missing = 0 if last is None else (number - last - 1) % 256
+        if missing < _LONGEST_GAP:
+            self.lost += missing
+        if self.log is not None and name != "SETUP_SIGNING":  # it holds a key
+            self.log.write(bytes(message.get_msgbuf()))
 
     def _announce(self, now_s: float) -> None:
         """STATUSTEXT of what has changed in mode and health since the last announcement, or else of the next note."""
@@ -179,26 +276,16 @@ class Endpoint:
             return
         mode, health = self.station.solution.mode, self.station.solution.health
         if (mode, health) != self._announced:
-            self._tell_change(mode, health)
+            for kind in changes(self._announced, (mode, health)):
+                self._say(kind.severity, kind.text)
+            self._announced = mode, health
         elif self._told < self.station.noted:
             notes, waiting = self.station.notes, min(self.station.noted - self._told, len(self.station.notes))
             self._say(*notes[-waiting])
             self._told = self.station.noted - waiting + 1
         else:
             return
-        self._announce_s = now_s + _ANNOUNCE_S
-
-    def _tell_change(self, mode: Mode, health: Health) -> None:
-        old_mode, old_health = self._announced
-        self._announced = mode, health
-        if mode != old_mode:
-            severity = mav.MAV_SEVERITY_WARNING if mode == Mode.DEGRADED else mav.MAV_SEVERITY_INFO
-            self._say(severity, _MODE_TEXT[mode])
-        for flag, (severity, text) in _HEALTH_TEXT.items():
-            if flag & health & ~old_health:
-                self._say(severity, text)
-            elif flag & old_health & ~health:
-                self._say(mav.MAV_SEVERITY_INFO, f"Over: {text}")
+        self._announce_s = now_s + PACE_S
 
     def _say(self, severity: int, text: str) -> None:
         """STATUSTEXT, of more than `_TEXT` characters in numbered pieces."""

@@ -46,6 +46,8 @@ class Intake:
         Takes the rows of `AIDING` on; a HilError of it refuses them.
     early : bool
         The alignment uses measurements: take them while it goes on. Else they are refused until the navigation has begun.
+    measurements : bool
+        False: commands of an operator alone are taken.
     """
 
     def __init__(
@@ -56,7 +58,9 @@ class Intake:
         take: Callable[[NDArray[Any]], None],
         *,
         early: bool = False,
+        measurements: bool = True,
     ) -> None:
+        self._measurements = measurements
         self._first = Mode.ALIGN if early else Mode.NAVIGATE
         self._senders, self._master, self._delay_s, self._take = frozenset(senders), master, delay_s, take
         self._last_s: dict[tuple[str, int, int], float] = {}
@@ -67,6 +71,8 @@ class Intake:
 
     def message(self, message: Any, station: "Station") -> None:
         """Take a message if it aids."""
+        if not self._measurements:
+            return
         name, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
         decoder = FROM_MASTER.get(name) if sender == self._master else None
         accepted = decoder is not None or sender[0] in self._senders
@@ -74,6 +80,10 @@ class Intake:
         if decoder is not None:
             place = Place(station.situation.home, station.geoid)
             self._attempt(name, sender, accepted, station, lambda time: decoder(message, time, place))
+
+    def allows(self, system: int) -> bool:
+        """Whether a system may change what measurements refer to."""
+        return system in self._senders
 
     def command(self, message: Any, params: list[float], station: "Station") -> int:
         """Take a command; the MAV_RESULT to acknowledge it with."""

@@ -1,8 +1,8 @@
 """Byte links for MAVLink: UDP, TCP and serial, none of which ever blocks.
 
 A link is one stream of frames to whoever listens at its other end. Its `fileno` never changes (it is an epoll over what
-the link holds open), so that it can be waited on while clients come and go. A peer that is slow or gone loses frames;
-the sender is told by `send`.
+the link holds open), so that it can be waited on while connections come and go. A peer that is slow or gone loses frames;
+the sender is told by `send`. A TCP server is a `Listener`, and each of its clients a link of its own.
 """
 
 import os
@@ -21,6 +21,8 @@ FORMS = "udpout:HOST:PORT, udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, seri
 _CHUNK = 2048
 """Most bytes taken at once: bounds the time that a flood can hold the sender up."""
 _UDP_PEERS = 4
+CLIENTS = 8
+"""Most clients of one TCP server."""
 _RETRY_S = 1.0
 _DEAD_PEER_MS = 5000
 _TCP_BUFFER = 65536
@@ -44,6 +46,13 @@ class Link(Protocol):
     def receive(self) -> bytes:
         """Bytes that have arrived, at most one datagram or chunk; empty when there are none."""
 
+    def heard(self) -> None:
+        """What `receive` returned last was good: its sender may be answered."""
+
+    @property
+    def gone(self) -> bool:
+        """The connection is over and does not come back."""
+
     def send(self, frame: bytes) -> bool:
         """Send a whole frame or nothing; False when it was dropped."""
 
@@ -51,7 +60,7 @@ class Link(Protocol):
         """Give everything back."""
 
 
-def open_link(url: str) -> Link:
+def open_link(url: str) -> "Link | Listener":
     """The link of a URL, see `FORMS`. A listening link listens on the very address given.
 
     Raises
@@ -80,10 +89,17 @@ def open_link(url: str) -> Link:
             return UdpLink(url, family, address, listen=kind == "udpin")
         if kind == "tcp":
             return StreamLink(url, lambda: _dial(family, address), lazy=True)
-        return StreamLink(url, None, listener=socket.create_server(address, family=family, backlog=4))
+        return Listener(url, socket.create_server(address, family=family, backlog=CLIENTS))
     except (OSError, ValueError, OverflowError) as error:  # pyserial's errors are OSErrors
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         raise HilError(f"MAVLink link {url!r}: cannot open it: {reason}") from error
+
+
+def listens_beyond(url: str) -> bool:
+    """Whether the link of a URL can be reached from other machines: its address is not one of this machine alone."""
+    kind, _, rest = url.partition(":")
+    place = rest.rpartition(":")[0].strip("[]")
+    return kind.endswith("in") and not (place in {"localhost", "::1"} or place.startswith("127."))
 
 
 class UdpLink:
@@ -96,6 +112,7 @@ class UdpLink:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._peers: list[tuple[str, int]] = []
+        self._last: tuple[str, int] | None = None
         self._only_host: str | None = None
         if listen:
             try:
@@ -130,12 +147,17 @@ class UdpLink:
         except OSError:  # nothing there, or the refusal of an earlier datagram
             return b""
         peer = (str(sender[0]), int(sender[1]))
-        if self._listens:
-            if peer not in self._peers:
-                self._peers = [peer, *self._peers][:_UDP_PEERS]
-        elif self._only_host not in (None, peer[0]):
+        if not self._listens and self._only_host not in (None, peer[0]):
             return b""
+        self._last = peer
         return data[:_CHUNK]
+
+    def heard(self) -> None:
+        """The sender of the last datagram is answered from now on, where we listen."""
+        if self._listens and self._last is not None and self._last not in self._peers:
+            self._peers = [self._last, *self._peers][:_UDP_PEERS]
+
+    gone = False
 
     def send(self, frame: bytes) -> bool:
         """Send to every peer; False when no peer could be sent to."""
@@ -154,10 +176,7 @@ class UdpLink:
 
 
 class StreamLink:
-    """A byte stream: a serial port or TCP connection made by `opener`, or the one client that `listener` has accepted.
-
-    A lost connection is opened again every second. A listener serves one client; more are turned away until it leaves.
-    """
+    """A byte stream: a serial port or TCP connection made by `opener`, again every second after a loss; or one `client`."""
 
     datagrams = False
 
@@ -166,20 +185,18 @@ class StreamLink:
         url: str,
         opener: Callable[[], Channel] | None,
         *,
-        listener: socket.socket | None = None,
+        client: socket.socket | None = None,
         lazy: bool = False,
     ) -> None:
         self.url = url
         self._opener = opener
-        self._listener = listener
         self._channel: Channel | None = None
         self._tail = b""
         self._retry_at = 0.0
         self._epoll = select.epoll()
-        if listener is not None:
-            listener.setblocking(False)
-            self._epoll.register(listener.fileno(), select.EPOLLIN)
-        if opener is not None and not lazy:
+        if client is not None:
+            self._take(client)
+        elif opener is not None and not lazy:
             try:
                 self._take(opener())
             except (OSError, ValueError, OverflowError):
@@ -191,9 +208,12 @@ class StreamLink:
         return self._epoll.fileno()
 
     @property
-    def port(self) -> int:
-        """The local port of a listener; 0 for every other link."""
-        return int(self._listener.getsockname()[1]) if self._listener is not None else 0
+    def gone(self) -> bool:
+        """The client has left."""
+        return self._channel is None and self._opener is None
+
+    def heard(self) -> None:
+        """There is but one peer: nothing to do."""
 
     def ready(self) -> bool:
         """Whether there is a connection (or one on its way); opens it again when it is time to."""
@@ -217,8 +237,6 @@ class StreamLink:
                 pass
             except OSError:
                 self._drop()
-        if self._listener is not None:
-            self._accept(self._listener)
         return data
 
     def send(self, frame: bytes) -> bool:
@@ -242,8 +260,6 @@ class StreamLink:
         """Give everything back."""
         self._drop()
         self._epoll.close()
-        if self._listener is not None:
-            self._listener.close()
 
     def _is_socket(self) -> bool:
         return isinstance(self._channel, socket.socket)
@@ -253,18 +269,6 @@ class StreamLink:
         fd = self._channel.fileno()
         lost = select.EPOLLHUP | select.EPOLLERR
         return any(found == fd and events & lost for found, events in self._epoll.poll(0))
-
-    def _accept(self, listener: socket.socket) -> None:
-        while True:
-            try:
-                client, _ = listener.accept()
-            except OSError:
-                return
-            if self._channel is None:
-                _tune(client)
-                self._take(client)
-            else:
-                client.close()
 
     def _take(self, channel: Channel) -> None:
         self._channel, self._tail = channel, b""
@@ -278,6 +282,45 @@ class StreamLink:
                 pass  # the device is gone, and its descriptor with it
             self._channel.close()
         self._channel, self._tail = None, b""
+
+
+class Listener:
+    """A TCP server: each client is a link of its own, so that none waits for another."""
+
+    def __init__(self, url: str, server: socket.socket) -> None:
+        self.url = url
+        self.turned_away = 0
+        """Clients for whom there was no room."""
+        self._server = server
+        server.setblocking(False)
+
+    def fileno(self) -> int:
+        """Descriptor to wait on for reading; constant."""
+        return self._server.fileno()
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        return int(self._server.getsockname()[1])
+
+    def accept(self, room: int) -> list[StreamLink]:
+        """Links of the clients that have come, `room` at most; the others are turned away."""
+        links: list[StreamLink] = []
+        while True:
+            try:
+                client, _ = self._server.accept()
+            except OSError:
+                return links
+            if len(links) < room:
+                _tune(client)
+                links.append(StreamLink(self.url, None, client=client))
+            else:
+                self.turned_away += 1
+                client.close()
+
+    def close(self) -> None:
+        """Give everything back."""
+        self._server.close()
 
 
 def _resolve(url: str, host: str, port: int, udp: bool) -> tuple[int, tuple[str, int]]:

@@ -6,13 +6,14 @@ altitudes are above mean sea level, times are device time.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from drivers.mavlink.solution import Home, Solution
+from drivers.mavlink.solution import Home, Solution, Vector
+from nav.errors import HilError
 from nav.state import Health, Mode, Ratio
 
 Message = Any
@@ -45,22 +46,60 @@ GOOD_POSITION_M, GOOD_VELOCITY_MS, GOOD_ATTITUDE = 10.0, 1.0, math.radians(5.0)
 """An estimate is called good up to this sigma (horizontal: of north and east together)."""
 
 
+FIX_S = 2.0
+"""A fix that is older than this is over."""
+
+
+@dataclass(frozen=True)
+class Fix:
+    """What a satellite receiver has measured, not what became of it in a filter."""
+
+    time: float
+    """Device time, s."""
+    place: Home
+    vel_n: Vector
+    sigma: tuple[float, ...]
+    """North, east, down of position and velocity, m and m/s; infinite where there is no value."""
+
+
+@dataclass(frozen=True)
+class ClockReading:
+    """The device's clock against the host's."""
+
+    offset_ns: int
+    """Host (UTC) less device."""
+    drift_ppm: float
+    """Positive: the device's clock is fast."""
+    bound_us: float
+    """Of the offset, beside the smallest delay of the transport, which is in it."""
+    steps: int
+    """Of either clock."""
+
+
 @dataclass(frozen=True)
 class Situation:
     """What a message says beside the solution."""
 
     vehicle_type: int = mav.MAV_TYPE_FIXED_WING
+    beside: bool = False
+    """We are a component beside an autopilot."""
+    fix: Fix | None = None
+    """The newest of a receiver."""
     home: Home | None = None
     lost: int = 0
     """Sensor samples lost since the start."""
     samples: int = 0
     """Sensor samples received since the start."""
+    clock: ClockReading | None = None
 
 
 def heartbeat(solution: Solution, situation: Situation) -> Message:
-    """HEARTBEAT of a navigation unit that is no autopilot: generic, never armed."""
+    """HEARTBEAT of a navigation unit that is no autopilot, never armed: a generic one where no autopilot is beside it."""
     status = _SYSTEM_STATUS[solution.mode]
-    return mav.MAVLink_heartbeat_message(situation.vehicle_type, mav.MAV_AUTOPILOT_GENERIC, 0, 0, status, 3)
+    kind, autopilot = situation.vehicle_type, mav.MAV_AUTOPILOT_GENERIC
+    if situation.beside:
+        kind, autopilot = mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID
+    return mav.MAVLink_heartbeat_message(kind, autopilot, 0, 0, status, 3)
 
 
 def sys_status(solution: Solution, situation: Situation) -> Message:
@@ -94,11 +133,21 @@ def sys_status(solution: Solution, situation: Situation) -> Message:
     )
 
 
-def system_time(solution: Solution, _: Situation) -> Message | None:
-    """SYSTEM_TIME: host time (UTC) at which the sample of this device time arrived."""
+def system_time(solution: Solution, situation: Situation) -> Message | None:
+    """SYSTEM_TIME: host time (UTC) of this device time; the arrival of the sample while the clocks are not compared."""
     if not solution.has_imu:
         return None
-    return mav.MAVLink_system_time_message(max(solution.arrival_ns, 0) // 1000, _boot_ms(solution))
+    clock = situation.clock
+    host_ns = solution.arrival_ns if clock is None else round(solution.time * 1e9) + clock.offset_ns
+    return mav.MAVLink_system_time_message(max(host_ns, 0) // 1000, _boot_ms(solution))
+
+
+def debug_vect(solution: Solution, situation: Situation) -> Message | None:
+    """DEBUG_VECT named CLOCK: drift of the device's clock (ppm), bound of its offset (us), steps."""
+    clock = situation.clock
+    if clock is None or not solution.has_imu:
+        return None
+    return mav.MAVLink_debug_vect_message(b"CLOCK", _boot_us(solution), clock.drift_ppm, clock.bound_us, clock.steps)
 
 
 def attitude(solution: Solution, _: Situation) -> Message | None:
@@ -183,13 +232,33 @@ def home_position(solution: Solution, situation: Situation) -> Message | None:
     )
 
 
-def gps_raw_int(solution: Solution, _: Situation) -> Message | None:
-    """GPS_RAW_INT: there is no satellite receiver, and the message says so."""
+def gps_raw_int(solution: Solution, situation: Situation) -> Message | None:
+    """GPS_RAW_INT: what a receiver has measured, and no fix where there is none; never our own solution."""
     if not solution.has_imu:
         return None
-    unknown = 65535
+    fix, unknown = situation.fix, 65535
+    if fix is None or not 0.0 <= solution.time - fix.time < FIX_S:
+        kind = mav.GPS_FIX_TYPE_NO_GPS if fix is None else mav.GPS_FIX_TYPE_NO_FIX
+        return mav.MAVLink_gps_raw_int_message(_boot_us(solution), kind, 0, 0, 0, *[unknown] * 4, 255)
+    high, moving = math.isfinite(fix.sigma[2]), max(fix.sigma[3:5]) < math.inf
+    north, east, _ = fix.vel_n
+    course = _integer(100.0 * math.degrees(math.atan2(east, north) % (2.0 * math.pi)), 0, 35999) if moving else unknown
+    place = fix.place
+    altitude_m = place.height - solution.geoid(place.lat, place.lon) if high else 0.0
     return mav.MAVLink_gps_raw_int_message(
-        _boot_us(solution), mav.GPS_FIX_TYPE_NO_GPS, 0, 0, 0, unknown, unknown, unknown, unknown, 255
+        round(fix.time * 1e6),
+        mav.GPS_FIX_TYPE_3D_FIX if high else mav.GPS_FIX_TYPE_2D_FIX,
+        *_degrees_e7(place.lat, place.lon),
+        _millimetres(altitude_m),
+        unknown,
+        unknown,
+        _integer(100.0 * math.hypot(north, east), 0, unknown - 1) if moving else unknown,
+        course,
+        255,
+        alt_ellipsoid=_millimetres(place.height) if high else 0,
+        h_acc=_accuracy(math.hypot(*fix.sigma[:2])),
+        v_acc=_accuracy(fix.sigma[2]),
+        vel_acc=_accuracy(math.hypot(*fix.sigma[3:5])),
     )
 
 
@@ -214,9 +283,15 @@ def odometry(solution: Solution, situation: Situation) -> Message | None:
 
 
 def estimator_status(solution: Solution, _: Situation) -> Message | None:
-    """ESTIMATOR_STATUS: innovations over their gates, one sigma of the position, what is good."""
+    """ESTIMATOR_STATUS: innovations over their gates, one sigma of the position, what is good.
+
+    Where nothing aids a solution whose position cannot be trusted, its attitude alone is good.
+    """
     if not solution.has_sigma:
-        return None
+        if not _untrusted(solution):
+            return None
+        nothing = [0.0] * 6 + [math.nan] * 2
+        return mav.MAVLink_estimator_status_message(_boot_us(solution), mav.ESTIMATOR_ATTITUDE, *nothing)
     ratio = solution.test_ratio
     flags = _estimate_flags(solution)
     if ratio[Ratio.POSITION] >= 1.0:
@@ -230,7 +305,7 @@ def estimator_status(solution: Solution, _: Situation) -> Message | None:
 def ekf_status_report(solution: Solution, _: Situation) -> Message | None:
     """EKF_STATUS_REPORT: the same for clients of ArduPilot; its variances are innovations over their gates."""
     if not solution.has_sigma:
-        return None
+        return mav.MAVLink_ekf_status_report_message(mav.EKF_ATTITUDE, *[0.0] * 6) if _untrusted(solution) else None
     flags = _estimate_flags(solution)
     if solution.test_ratio[Ratio.POSITION] >= 1.0:
         flags |= mav.EKF_GPS_GLITCHING
@@ -261,12 +336,43 @@ KINDS = {
     "ESTIMATOR_STATUS": Kind(estimator_status, 2.0, "SR_EST_HZ"),
     "EKF_STATUS_REPORT": Kind(ekf_status_report, 2.0, "SR_EKF_HZ"),
     "SYSTEM_TIME": Kind(system_time, 1.0, "SR_TIME_HZ"),
+    "DEBUG_VECT": Kind(debug_vect, 1.0, "SR_CLOCK_HZ"),
     "GPS_RAW_INT": Kind(gps_raw_int, 1.0, "SR_GPS_HZ"),
     "SYS_STATUS": Kind(sys_status, 2.0, "SR_SYS_HZ", from_solution=False),
     "HOME_POSITION": Kind(home_position, 0.2, "SR_HOME_HZ", from_solution=False),
     "HEARTBEAT": Kind(heartbeat, 1.0, "SR_BEAT_HZ", from_solution=False),
 }
 """Every message that is sent at a rate, most urgent first."""
+
+
+SHORTEST_INTERVAL_S = 0.001
+LONGEST_HEARTBEAT_S = 2.0
+"""Ground stations declare the link lost after 3.5 s."""
+
+
+def slowest_hz(name: str) -> float:
+    """Lowest rate of a message of the table."""
+    return 1.0 / LONGEST_HEARTBEAT_S if name == "HEARTBEAT" else 0.0
+
+
+def check_rates(rates_hz: Mapping[str, float], where: str) -> None:
+    """Refuse rates of unknown messages and those out of range; `where` names them.
+
+    Raises
+    ------
+    HilError
+        There is one.
+    """
+    for name, rate_hz in rates_hz.items():
+        if name not in KINDS:
+            raise HilError(f"{where}.{name}: unknown message; expected one of {', '.join(KINDS)}")
+        lowest = slowest_hz(name)
+        if not lowest <= rate_hz <= 1.0 / SHORTEST_INTERVAL_S:
+            raise HilError(f"{where}.{name} = {rate_hz}: expected {lowest:g} to 1000 Hz")
+
+
+def _untrusted(solution: Solution) -> bool:
+    return solution.has_position and solution.mode == Mode.NAVIGATE and bool(solution.health & Health.UNAIDED)
 
 
 def _estimate_flags(solution: Solution) -> int:
@@ -301,6 +407,11 @@ def _boot_us(solution: Solution) -> int:
 
 def _integer(value: float, lowest: int, highest: int) -> int:
     return min(max(round(value), lowest), highest)
+
+
+def _accuracy(metres: float) -> int:
+    """In millimetres; 0 where it is not known."""
+    return _integer(1000.0 * metres, 1, 2**32 - 1) if math.isfinite(metres) else 0
 
 
 def _millimetres(metres: float) -> int:

@@ -33,6 +33,14 @@ class Home:
     lon: float
     height: float
 
+    def offset(self, place: "Home") -> Vector:
+        """`place` north, east, down of here in the local level of here, m."""
+        dx, dy, dz = (a - b for a, b in zip(_ecef_of(place), _ecef_of(self), strict=True))
+        s, c = math.sin(self.lat), math.cos(self.lat)
+        sl, cl = math.sin(self.lon), math.cos(self.lon)
+        outward = cl * dx + sl * dy
+        return c * dz - s * outward, cl * dy - sl * dx, -(c * outward + s * dz)
+
 
 @dataclass(frozen=True)
 class Solution:
@@ -135,11 +143,7 @@ class Solution:
 
     def relative_to(self, home: Home) -> Vector:
         """Position north, east, down of `home` in its local level, m."""
-        dx, dy, dz = (a - b for a, b in zip(_ecef(self.lat, self.lon, self.height), _ecef_of(home), strict=True))
-        s, c = math.sin(home.lat), math.cos(home.lat)
-        sl, cl = math.sin(home.lon), math.cos(home.lon)
-        outward = cl * dx + sl * dy
-        return c * dz - s * outward, cl * dy - sl * dx, -(c * outward + s * dz)
+        return home.offset(Home(self.lat, self.lon, self.height))
 
 
 def geodetic(home: Home, ned: Vector) -> Vector:
@@ -162,15 +166,11 @@ def _usable(*values: float) -> bool:
     return all(abs(value) < _LARGEST for value in values)  # False for NaN too
 
 
-def _ecef_of(home: Home) -> Vector:
-    return _ecef(home.lat, home.lon, home.height)
-
-
-def _ecef(lat: float, lon: float, height: float) -> Vector:
-    s, c = math.sin(lat), math.cos(lat)
+def _ecef_of(place: Home) -> Vector:
+    s, c = math.sin(place.lat), math.cos(place.lat)
     prime = A / math.sqrt(1.0 - E2 * s * s)
-    level = (prime + height) * c
-    return level * math.cos(lon), level * math.sin(lon), (prime * (1.0 - E2) + height) * s
+    level = (prime + place.height) * c
+    return level * math.cos(place.lon), level * math.sin(place.lon), (prime * (1.0 - E2) + place.height) * s
 
 
 def _rotated(q: tuple[float, float, float, float], v: Vector) -> Vector:

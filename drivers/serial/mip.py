@@ -26,6 +26,7 @@ IDLE, RESUME, BASE_RATE, FORMAT, STREAM, ACKNOWLEDGE = 0x02, 0x06, 0x0E, 0x0F, 0
 WRITE, READ = 0x01, 0x02
 """Function selectors."""
 _WEEK_NS = 604_800 * 10**9
+_LONGEST_STEP_NS = 100 * 10**9
 _VECTORS = {ACCELERATION, RATE, DELTA_THETA, DELTA_VELOCITY}
 _OVERRANGED = 0x0077
 """Bits of the overrange status: axes of the accelerometer and of the gyro."""
@@ -91,17 +92,18 @@ class Mip:
         time_ns = _time_ns(fields)
         if time_ns is None or not {turn, push} <= fields.keys():
             return "short"
-        if any(len(fields[name]) != 12 for name in (turn, push)):
+        step = fields.get(REFERENCE_STEP, b"") if coned else b""
+        step_ns = struct.unpack(">Q", step)[0] if len(step) == 8 else 0
+        if any(len(fields[name]) != 12 for name in (turn, push)) or step_ns > _LONGEST_STEP_NS:
             return "short"
         force = _three(fields[push])
         overrange = fields.get(OVERRANGE, b"")
-        step = fields.get(REFERENCE_STEP, b"") if coned else b""
         return Reading(
             time_ns=time_ns,
             turn=_three(fields[turn]),
             push=(force[0] * STANDARD_GRAVITY, force[1] * STANDARD_GRAVITY, force[2] * STANDARD_GRAVITY),
             coned=coned,
-            step_ns=struct.unpack(">Q", step)[0] if len(step) == 8 else 0,
+            step_ns=step_ns,
             suspect=len(overrange) == 2 and bool(struct.unpack(">H", overrange)[0] & _OVERRANGED),
         )
 

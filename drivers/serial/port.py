@@ -48,6 +48,8 @@ class SerialPort:
         """Chunks that the port did not take."""
         self.failures = 0
         """Times the port was lost."""
+        self.trouble = ""
+        """Why it cannot be used now."""
         self._poll = select.poll()
         self._fd = -1
         self._port: serial.SerialBase | None = None
@@ -66,6 +68,7 @@ class SerialPort:
 
     def _failed(self) -> None:
         self.failures += 1
+        self.trouble = f"{self.url}: the port is lost: unplugged?"
         self.close()
         self._retry = time.monotonic() + REOPEN_S
 
@@ -73,6 +76,7 @@ class SerialPort:
         if self._port is None and time.monotonic() >= self._retry:
             try:
                 self._open()
+                self.trouble = ""
             except HilError:
                 self._retry = time.monotonic() + REOPEN_S
         return self._port is not None

@@ -11,6 +11,9 @@ from drivers import Counters
 NEAR = 8
 """Most samples that may be missing behind one that was set aside for it to count as continued."""
 
+LONGEST_NS = 3_600_000_000_000
+"""No gap is longer: a leap of the clock beyond it is damage, or a board that started anew."""
+
 
 class Timeline:
     """Time and number of each sample; int ns.
@@ -47,7 +50,7 @@ class Timeline:
         if elapsed == 0 and (not self._turn or counter == self._last[1]):
             self._counters.duplicated += 1
             return 0
-        steps = self._steps(elapsed, counter, said_ns) if elapsed > 0 else 0
+        steps = self._steps(elapsed, counter, said_ns) if 0 < elapsed <= LONGEST_NS else 0
         if steps <= 0:
             return self._set_aside(here, said_ns)
         if self._aside is not None:

@@ -15,7 +15,7 @@ import struct
 from binascii import crc_hqx
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import lru_cache, reduce
 from operator import xor
 
 from drivers.serial.dialog import Dialog, check_line
@@ -64,7 +64,7 @@ class Layout:
     saturation: int
 
 
-@cache
+@lru_cache(256)
 def layout(header: bytes) -> Layout | None:
     """The layout behind a header (groups and masks); None when a field of it is unknown."""
     groups = [group for group in range(7) if header[0] >> group & 1]

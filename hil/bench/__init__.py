@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from hil.bench import aided, attitude, chain, instruments, strapdown
+from hil.bench import aided, attitude, chain, instruments, receive, strapdown
 from hil.bench.timing import Row, Sizes
 
 
@@ -16,6 +16,7 @@ def measure(say: Callable[[str], None], sizes: Sizes | None = None) -> list[Row]
     sizes = sizes or Sizes()
     return [
         *chain.rows(sizes),
+        *receive.rows(sizes),
         *aided.rows(sizes),
         *strapdown.rows(sizes),
         *attitude.rows(sizes),

@@ -20,7 +20,7 @@ from hil.dashboard.bus_load import bus_load
 from hil.dashboard.comparison import Comparison, angles_deg
 from hil.health import HEALTH
 from hil.link_stats import LinkStats
-from hil.stats import Phase
+from hil.stats import Phase, Times
 from nav.instruments.redundancy import AXES, Fault
 from nav.state import NAV_STATE, Health, Mode
 
@@ -35,7 +35,7 @@ TRACK = 1200
 """Most points of the track; then every second one goes."""
 LOSSES = (
     *("lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors"),
-    *("restarts", "interpolated", "silences", "recorder_lost"),
+    *("restarts", "frozen", "clock_steps", "interpolated", "silences", "recorder_lost"),
 )
 BAD_HEALTH = Health.SILENT | Health.SENSOR | Health.UNITS
 """Reasons that are told in red; those besides them in amber."""
@@ -91,11 +91,15 @@ class Histogram:
 
     def add(self, times_us: NDArray[Any], now_s: float) -> None:
         """Count (n,) times, us."""
+        places = np.searchsorted(EDGES_US, times_us, "right")
+        self.add_counts(np.bincount(places, minlength=len(EDGES_US) + 1), now_s)
+
+    def add_counts(self, counts: NDArray[np.int64], now_s: float) -> None:
+        """Add to each bin."""
         if int(now_s) != self._second:
             self._second = int(now_s)
             self._slots.append(np.zeros(len(EDGES_US) + 1, np.int64))
-        places = np.searchsorted(EDGES_US, times_us)
-        self._slots[-1] += np.bincount(places, minlength=len(EDGES_US) + 1)
+        self._slots[-1] += counts
 
     def counts(self) -> list[int]:
         """Of each bin."""
@@ -119,6 +123,7 @@ class View:
         self._notes, self._note_number = np.zeros(64, EVENTS), 0
         self._comparison: Comparison | None = None
         self._histograms = {"age": Histogram(), "jitter": Histogram()}
+        self._aged = np.zeros(len(EDGES_US) + 1, np.int64)
         self._before: tuple[float, dict[str, int]] = (time.monotonic(), {})
         self._rates: dict[str, float] = {}
         self._losses = dict.fromkeys(LOSSES, 0)
@@ -210,6 +215,7 @@ class View:
             return {"k": "slow", "state": "starting"}
         now_s = time.monotonic()
         self._differentiate(now_s)
+        self._add_ages(now_s)
         silent = now_s - self._arrived_s > 1.0
         health = Health(int(row["health"])) | (Health.SILENT if silent and self._number else Health.GOOD)
         mode = Mode(int(row["mode"]))
@@ -253,15 +259,19 @@ class View:
         return ""
 
     def _measure(self, rows: NDArray[Any]) -> None:
-        """Ages and jitter of rows, the first of them seen before."""
+        """Jitter of rows, the first of them seen before."""
         good = (rows["health"] & Health.SILENT.value) == 0
         now_s = time.monotonic()
-        ages = (rows["solution_ns"] - rows["arrival_ns"])[1:][good[1:]]
-        self._histograms["age"].add(ages / 1e3, now_s)
         came, sent = np.diff(rows["arrival_ns"]) / 1e3, np.diff(rows["time"]) * 1e6
         seen = (rows["arrival_ns"][:-1] > 0) & good[:-1]  # the first row of all has none before it
         steady = seen & good[1:] & (np.diff(rows["sequence"]) == 1) & (came > 0.0)
         self._histograms["jitter"].add(np.abs(came - sent)[steady], now_s)
+
+    def _add_ages(self, now_s: float) -> None:
+        """What the loop has counted since the last look."""
+        aged = np.array(self._outlets.stats.histogram(Times.AGE, (0, *EDGES_US)))
+        self._histograms["age"].add_counts(aged - self._aged, now_s)
+        self._aged = aged
 
     def _add_to_track(self) -> None:
         row = self._last[0]

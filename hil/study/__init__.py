@@ -20,6 +20,7 @@ _MODULES = {
         "alignment",
         "aiding",
         "tracking",
+        "clock",
     )
 }
 """Studies by name: modules with a function ``run() -> Study``."""

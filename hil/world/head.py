@@ -24,7 +24,9 @@ from hil.pacing import Pacer
 from hil.scenario import Scenario
 from hil.stats import Stats
 from hil.warmup import warm_head
+from hil.wire_config import check_board
 from hil.world.aiding import SimulatedAiding
+from hil.world.faults import Wire
 from hil.world.injection import Injection
 from hil.world.instruments import instruments
 from nav.errors import HilError
@@ -56,6 +58,8 @@ class SimulatedHead:
             hardware=SIMULATED,
             rotor_hz=head.rotor.spin_hz,
         )
+        check_board(scenario.driver, scenario.wire)
+        self.wire = Wire(scenario, self.period_us, self.frames_per_sample) if scenario.wire else None
         self.injection: Injection | None = None
         """Faults that it is told to have while it runs."""
         self._aiding, self._aiding_encoder = SimulatedAiding(scenario), AidingEncoder()
@@ -83,13 +87,17 @@ class SimulatedHead:
             self.injection.sensed(first, sensed)
         counter = np.arange(first, first + count)
         ends = (counter + 1) * self.period_us
+        said, shown = counter, ends
+        if self.wire is not None:
+            said, shown = self.wire.device.numbers(counter), ends + self.wire.device.clock_errors(counter)
         if self._board is None:
-            batch = self._encoder.samples(counter, ends, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
+            batch = self._encoder.samples(said, shown, sensed.dtheta, sensed.dvel, sensed.status, sensed.rotor)
         else:
             dtheta: FloatArray = sensed.dtheta @ self._axes.T
-            time = np.asarray(1e-6 * ends, np.float64)
+            time = np.asarray(1e-6 * shown, np.float64)
             step = np.full(count, self.step)
-            batch = self._board.samples(ImuIncrements(time, step, dtheta, sensed.dvel, sensed.status, counter))
+            batch = self._board.samples(ImuIncrements(time, step, dtheta, sensed.dvel, sensed.status, said))
+            batch["time_ns"] += np.repeat(1000 * (ends - shown), self.frames_per_sample)  # a wrong clock sends no later
         rows, arrivals = self._aiding.arrived(int(ends[-1]))
         if len(rows) == 0:
             return batch
@@ -118,6 +126,12 @@ def board_of(scenario: Scenario, period_us: int) -> BoardEmulator:
 def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool, cancelled: Callable[[], bool]) -> int:
     """Send the head's frames, each sample at its time when `paced`; the number of samples sent."""
     pacer = Pacer()
+    if head.wire is not None:
+        for due_s, piece in faulty(head, head.wire, samples):
+            if cancelled() or (paced and not pacer.wait(due_s, cancelled)):
+                break
+            port.send(piece if head.injection is None else head.injection.sent(head.wire.samples, piece))
+        return head.wire.samples
     k = head.frames_per_sample
     sent = 0
     for first, slow, batch in head.chunks(samples):
@@ -138,10 +152,17 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
     return sent
 
 
+def faulty(head: SimulatedHead, wire: Wire, samples: int | None) -> Iterator[tuple[float, FrameArray]]:
+    """(when they are due, s; frames) of the head as its faulty wire hands them on."""
+    for first, slow, batch in head.chunks(samples):
+        yield from wire.take(first, slow, batch)
+    yield from wire.finish()
+
+
 def run_head(scenario: Scenario, paced: bool, control: Control, stats: Stats, answer: Connection) -> None:
     """Target of the head's process: begins on `Control.go`.
 
-    Answers ``{"sent": samples, "dropped": frames}`` or ``{"failed": message}``.
+    Answers ``{"sent": samples, "dropped": frames}``, with ``"wire"`` where it is faulty, or ``{"failed": message}``.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -158,7 +179,7 @@ def run_head(scenario: Scenario, paced: bool, control: Control, stats: Stats, an
 
 
 def feed(head: SimulatedHead, scenario: Scenario, *, paced: bool, cancelled: Callable[[], bool]) -> dict[str, object]:
-    """Run `head` on the scenario's bus to the scenario's end; samples sent and frames dropped."""
+    """Run `head` on the scenario's bus to the scenario's end; samples sent, frames dropped, and what the wire did."""
     duration = scenario.duration_s
     samples = None if duration is None else math.ceil(duration / head.step - 1e-6)
     port = open_port(scenario.bus, listen=False, lossless=not paced)
@@ -167,4 +188,5 @@ def feed(head: SimulatedHead, scenario: Scenario, *, paced: bool, cancelled: Cal
     finally:
         dropped = port.dropped
         port.close()
-    return {"sent": sent, "dropped": dropped}
+    wire = {} if head.wire is None else {"wire": head.wire.report()}
+    return {"sent": sent, "dropped": dropped, **wire}

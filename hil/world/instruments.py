@@ -17,6 +17,7 @@ from drivers.can.dtg_head_emulator import ANGLE_LSB, VELOCITY_LSB
 from hil.calibration import CalibrationFile, rotor_of
 from hil.scenario import HeadConfig, Scenario
 from hil.world.motion import Motion
+from nav.alignment.axes import matrix, rotation
 from nav.alignment.rest import UNSTATED, Sensors
 from nav.earth import STANDARD_GRAVITY as _G
 from nav.errors import HilError
@@ -66,7 +67,11 @@ class Sensed:
 
 
 def mounting(head: HeadConfig) -> FloatArray:
-    """C_bh (3, 3)."""
+    """C_bh (3, 3), as the scenario says it in one of three ways."""
+    if head.axes is not None:
+        return matrix(head.axes)
+    if head.mounting is not None:
+        return rotation(head.mounting)
     c: FloatArray = dcm_from_quaternion(quaternion_from_euler(*np.radians(head.mounting_deg)))
     return c
 

@@ -13,7 +13,9 @@ from nav.rotation import attitude_error
 from nav.state import Mode
 
 RATE_HZ = 100.0
-"""Samples a second that are compared (the last one always is)."""
+"""Samples a second that are compared."""
+SETTLE = 64
+"""Takings that wait at most."""
 
 
 class TruthKeeper:
@@ -25,12 +27,25 @@ class TruthKeeper:
         self.position, self.velocity, self.attitude = Spread(), Spread(), Spread()
         self._normal = {name: Spread() for name in ("position", "velocity", "attitude")}
         self.tilt, self.heading = Spread(), Spread()
+        self._waiting: list[NDArray[Any]] = []
 
     def compare(self, rows: NDArray[Any]) -> None:
-        """Take solutions; those before the end of the alignment and those not of the grid are passed over."""
+        """Take solutions; those before the end of the alignment and those not of the grid are passed over.
+
+        What they differ by is found out for `SETTLE` at a time, because one by one they take ten times as long.
+        """
         if len(rows) == 1 and rows["sequence"][0] % self._every:
             return
-        chosen = rows[(rows["sequence"] % self._every == 0) & (rows["mode"] >= Mode.NAVIGATE)]
+        self._waiting.append(rows[(rows["sequence"] % self._every == 0) & (rows["mode"] >= Mode.NAVIGATE)])
+        if len(self._waiting) >= SETTLE:
+            self.settle()
+
+    def settle(self) -> None:
+        """Find out what the solutions taken so far differ by."""
+        if not self._waiting:
+            return
+        chosen: Any = np.concatenate(self._waiting)
+        self._waiting.clear()
         if len(chosen) == 0:
             return
         truth = self.motion.truth(np.ascontiguousarray(chosen["time"]))
@@ -51,10 +66,12 @@ class TruthKeeper:
 
     def ratios(self) -> dict[str, float]:
         """Rms of error over sigma, of all axes: 1 where the estimate of the error is right; empty where there was none."""
+        self.settle()
         return {name: spread.as_dict()["rms"] for name, spread in self._normal.items() if spread.count}
 
     def summary(self) -> dict[str, dict[str, float]] | None:
         """Errors by name, each rms, max, final; None when nothing was compared."""
+        self.settle()
         if self.position.count == 0:
             return None
         return {

@@ -22,6 +22,15 @@ FORCE_LIMIT = 0.05
 TURN_LIMIT = 0.1
 """A mean rate above this is motion and not bias, rad/s."""
 
+_LIES = {
+    "+x": ("stands on its tail", "x and z look swapped"),
+    "-x": ("stands on its nose", "x and z look swapped"),
+    "+y": ("lies on its left side", "y and z look swapped"),
+    "-y": ("lies on its right side", "y and z look swapped"),
+    "+z": ("lies on its back", "the sign of z looks wrong (z points up)"),
+}
+"""What the body does, and else what looks wrong, where the specific force is along an axis."""
+
 # Layout of the sums: block time, dtheta, dvel | total time, dtheta, dvel | blocks, sum of squares of block rate, force
 _BLOCK, _TOTAL, _COUNT, _SQUARES = 0, 7, 14, 15
 SUMS = 21
@@ -164,3 +173,16 @@ def gravity_verdict(f_b: FloatArray) -> str | None:
     if math.isfinite(g) and abs(g - 1.0) <= 0.05:
         return None
     return f"specific force at rest is {g:.2f} g: units or signs?"
+
+
+def upright_verdict(f_b: FloatArray) -> str | None:
+    """What a specific force at rest (3,) that is nearer to another axis than -z says of the mounting; None where it is not."""
+    axis = int(np.abs(f_b).argmax())
+    if axis == 2 and f_b[2] <= 0.0:
+        return None
+    along = ("-" if f_b[axis] < 0.0 else "+") + "xyz"[axis]
+    lies, wrong = _LIES[along]
+    return (
+        f"specific force at rest is along {along} of the body and not -z: the vehicle {lies}, or {wrong}: "
+        "see head.axes, and hil check-axes"
+    )

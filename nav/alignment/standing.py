@@ -38,6 +38,8 @@ class AtRest:
         self._sensors = replace(plan.sensors, angle_random_walk=0.0, velocity_random_walk=0.0)
         self._sums, self._towards = np.zeros(rest.SUMS), np.zeros(2)
         self._sigma_heading = math.inf
+        self._looked = False
+        """The user has been told how the vehicle seems to lie."""
 
     @property
     def progress(self) -> float:
@@ -67,19 +69,21 @@ class AtRest:
         mean = rest.means(self._sums)
         wrong = rest.gravity_verdict(mean.f)
         complaints = ((Health.UNITS, wrong),) if wrong else ()
+        notice = "" if self._looked or wrong else rest.upright_verdict(mean.f) or ""
+        self._looked = True
         if not complete:
-            return Word(complaints, Health.MOVING)
+            return Word(complaints, Health.MOVING, notice)
         try:
             result = self._result(mean)
         except AlignmentRefused as refusal:
             self._anew()
             complaints = complaints or ((Health.RATE_TOO_SMALL, str(refusal)),)
-            return Word(complaints, Health.MOVING)
+            return Word(complaints, Health.MOVING, notice)
         sigma = np.concatenate([np.zeros(6), np.sqrt(np.diag(result.covariance))])
         place = place_of_sensor(self._place, result.q_nb, self._plan.lever_arm)
         remark = f"{np.linalg.norm(mean.f) / STANDARD_GRAVITY:.3f} g"
         start = Start(time, place, np.zeros(3), result.q_nb, result.gyro_bias, sigma, mean.time_s, remark)
-        return Word(complaints, GIVEN_UP, start=start)
+        return Word(complaints, GIVEN_UP, notice, start)
 
     def _result(self, mean: rest.Means) -> Alignment:
         plan, lat = self._plan, float(self._place[0])

@@ -31,21 +31,13 @@ from nav.filter.settings import Settings
 from nav.filter.states import Tuning
 from nav.increments import FloatArray, ImuIncrements
 from nav.step import POLE
-from nav.strapdown import Strapdown
+from nav.strapdown import Answers, Strapdown
 
 __all__ = ["AidedNavigator", "Answers", "Judged", "Restart", "Settings"]
 
 _NOTHING = np.zeros(3)
 _ROOM = 4096
 """Samples that there is room for at the start."""
-
-
-class Answers(NamedTuple):
-    """The solution at the end of each sample: lat, lon (rad), height (m); vel_n, m/s; q_nb."""
-
-    position: FloatArray
-    velocity: FloatArray
-    attitude: FloatArray
 
 
 class _Memory(NamedTuple):

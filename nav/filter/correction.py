@@ -81,6 +81,7 @@ class Correction:
         self._core, self._recorder = core, recorder
         self._gate = [quantile(settings.gate, m + 1) for m in range(MEASURED)]
         self._field = np.zeros(3) if settings.field_n is None else np.array(settings.field_n, float)
+        self._apart = {source: np.subtract(arm, settings.lever_arm) for source, arm in settings.antennas}
         self._declination = math.atan2(self._field[1], self._field[0])
         self.estimates, self._known, self._sigma = np.zeros(STATES), np.zeros(STATES), np.zeros(9)
         self._instant = np.zeros(models.INSTANT)
@@ -155,6 +156,8 @@ class Correction:
 
     def _gnss(self, model: Any, row: Row, part: slice) -> int:
         arm, delay = self.estimates[LEVER_ARM], float(self.estimates[GNSS_DELAY][0])
+        if row.source in self._apart:
+            arm = arm + self._apart[row.source]
         at, age, to = self._instant, self.time - row.time, (self._h, self._residual, self._variance)
         return int(model(at, arm, delay, row.value[part], row.sigma[part], age, *to))
 

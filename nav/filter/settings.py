@@ -22,6 +22,8 @@ class Settings:
         A position source that is rejected for so long, s, is right and the filter has diverged: it restarts there. `inf`: never.
     lever_arm : (3,) float
         From the navigated point (the sensor, if it is not moved) to the GNSS antenna, b, m, as first known.
+    antennas : tuple of (int, (3,) float)
+        Sources of GNSS that have antennas of their own, and where, likewise. An estimated lever arm moves all of them.
     delay : float
         How much older GNSS is than it says, s, as far as known: it is taken at that time. The estimated delay is what is left.
     field_n : (3,) float, optional
@@ -35,6 +37,7 @@ class Settings:
     gate: float = 0.999
     restart_s: float = 30.0
     lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antennas: tuple[tuple[int, tuple[float, float, float]], ...] = ()
     delay: float = 0.0
     field_n: tuple[float, float, float] | None = None
     magnetic_heading: bool = False

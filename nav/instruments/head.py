@@ -63,6 +63,10 @@ class HeadModel:
     variances: FloatArray | None = None
 
 
+_Views = tuple[FloatArray, ImuIncrements, IntArray, FloatArray]
+"""Of some samples: increments of the gyro axes, what becomes of them, what is said of them, parity residual."""
+
+
 @dataclass(frozen=True, slots=True)
 class Note:
     """Something that the user is told of an instrument."""
@@ -73,9 +77,7 @@ class Note:
 
 
 @kernel
-def _combine(
-    gyro: FloatArray, dvel: FloatArray, inverse: FloatArray, flag: int, dtheta: FloatArray, validity: IntArray
-) -> None:
+def _combine(gyro: FloatArray, inverse: FloatArray, flag: int, dtheta: FloatArray, validity: IntArray) -> None:
     for k in range(gyro.shape[0]):
         a, b, c, d = gyro[k, 0], gyro[k, 1], gyro[k, 2], gyro[k, 3]
         for i in range(3):
@@ -84,12 +86,44 @@ def _combine(
 
 
 @kernel
-def _turn(c_bh: FloatArray, vectors: FloatArray) -> None:
+def _turn(c_bh: FloatArray, dtheta: FloatArray, dvel: FloatArray) -> None:
     """Head axes to body axes, in place."""
-    for k in range(vectors.shape[0]):
-        x, y, z = vectors[k, 0], vectors[k, 1], vectors[k, 2]
+    for vectors in (dtheta, dvel):
+        for k in range(vectors.shape[0]):
+            x, y, z = vectors[k, 0], vectors[k, 1], vectors[k, 2]
+            for i in range(3):
+                vectors[k, i] = c_bh[i, 0] * x + c_bh[i, 1] * y + c_bh[i, 2] * z
+
+
+@kernel
+def _take_over(
+    status: IntArray,
+    spin: FloatArray,
+    speeds: FloatArray,
+    dvel: FloatArray,
+    validity: IntArray,
+    said: IntArray,
+    dvel_out: FloatArray,
+    validity_out: IntArray,
+) -> None:
+    """What passes as it is; `said`: status bits of the instruments, and of the gyros whose rotor does not have its speed."""
+    for k in range(status.shape[0]):
+        said[k] = status[k] & 0x1F
+        for gyro in range(speeds.shape[0]):
+            if abs(spin[k, gyro] / speeds[gyro] - 1.0) > SPEED_TOLERANCE:
+                said[k] |= 1 << gyro
         for i in range(3):
-            vectors[k, i] = c_bh[i, 0] * x + c_bh[i, 1] * y + c_bh[i, 2] * z
+            dvel_out[k, i] = dvel[k, i]
+        validity_out[k] = validity[k]
+
+
+@kernel
+def _same_until(said: IntArray, start: int) -> int:
+    """The end of the samples from `start` on of which the same is said."""
+    for k in range(start + 1, said.shape[0]):
+        if said[k] != said[start]:
+            return k
+    return int(said.shape[0])
 
 
 class HeadCombiner:
@@ -124,7 +158,9 @@ class HeadCombiner:
         self._notes: list[Note] = []
         self.faults = np.zeros(7, np.int64)
         self.residual = np.zeros(0)
+        self._views: dict[int, _Views] = {}
         self._room(256)
+        self._speeds = np.array([rotor.spin / (2.0 * math.pi) for rotor in self._rotors or ()])
         self.renew()
 
     def renew(self) -> None:
@@ -152,46 +188,33 @@ class HeadCombiner:
             An increment is not finite.
         """
         n = len(head)
-        if n > len(self._imu):
-            self._room(2 * n)
-        gyro, dtheta, dvel = self._gyro[:n], self._imu.dtheta[:n], self._imu.dvel[:n]
-        validity, self.residual = self._imu.validity[:n], self._residuals[:n]
+        gyro, imu, said, self.residual = self._views.get(n) or self._view(n)
+        dtheta, dvel, validity = imu.dtheta, imu.dvel, imu.validity
         if self._lag is None:
             gyro[:] = head.dtheta
         else:
             self._lag.compensate(head, gyro)
-        dvel[:], validity[:] = head.dvel, head.validity
+        _take_over(head.status, head.spin, self._speeds, head.dvel, head.validity, said, dvel, validity)
         self._calibrate(head, gyro, dvel)
-        said = self._said(head)
         start = 0
         while start < n:
             if said[start] != self._status:
                 self._take_status(float(head.time[start]), int(said[start]))
-            changes = np.flatnonzero(said[start:] != self._status)
-            stop = start + int(changes[0]) if len(changes) else n
+            stop = _same_until(said, start)
             before = self.faults.copy()
-            done = redundancy.examine(
-                self._memory,
-                self.faults,
-                head.time[start:stop],
-                head.step[start:stop],
-                head.dtheta[start:stop],
-                gyro[start:stop],
-                head.dvel[start:stop],
-                self._parity,
-                self._limits,
-                self._pair,
-                self.residual[start:stop],
-            )
-            part = slice(start, start + done)
-            _combine(gyro[part], dvel[part], self._inverse, self._flag, dtheta[part], validity[part])
+            sent, clean, residual = head, gyro, self.residual
+            if start > 0 or stop < n:
+                sent, clean, residual = head.rows(start, stop), gyro[start:stop], residual[start:stop]
+            seen = sent.time, sent.step, sent.dtheta, clean, sent.dvel
+            tests = self._parity, self._limits, self._pair
+            done = redundancy.examine(self._memory, self.faults, *seen, *tests, residual)
+            _combine(clean[:done], self._inverse, self._flag, dtheta[start:], validity[start:])
             start += done
-            if (self.faults != before).any():
+            if self.faults.tobytes() != before.tobytes():
                 self._tell(float(head.time[start - 1]), before)
         if self._size is not None:
             take_off_size_effect(self._size_memory, self._size, head.step, dtheta, dvel, dvel)
-        _turn(self._c_bh, dtheta)
-        _turn(self._c_bh, dvel)
+        _turn(self._c_bh, dtheta, dvel)
         return ImuIncrements(head.time, head.step, dtheta, dvel, validity, head.sequence)
 
     def _calibrate(self, head: HeadIncrements, gyro: FloatArray, dvel: FloatArray) -> None:
@@ -203,15 +226,6 @@ class HeadCombiner:
             where = outside(self._calibration, head.temperature[left])
             text = f"the calibration does not reach this temperature: {where} C; the values of its edge are used"
             self._notes.append(Note(float(head.time[left]), True, text))
-
-    def _said(self, head: HeadIncrements) -> IntArray:
-        """Status bits of the instruments, and of the gyros whose rotor does not have its speed."""
-        status: IntArray = head.status & 0x1F
-        for gyro, rotor in enumerate(self._rotors or ()):
-            wrong = np.abs(head.spin[:, gyro] * (2.0 * math.pi / rotor.spin) - 1.0) > SPEED_TOLERANCE
-            if wrong.any():
-                status = status | np.where(wrong, 1 << gyro, 0)
-        return status
 
     def _take_status(self, time: float, status: int) -> None:
         before, self._status = self.faults.copy(), status
@@ -270,9 +284,17 @@ class HeadCombiner:
             return "the others carry on, none is left to spare"
         return "no other axis measures its rate: attitude is not to be trusted"
 
+    def _view(self, n: int) -> _Views:
+        """Room for `n` samples, made once."""
+        if n > len(self._imu):
+            self._room(2 * n)
+        self._views[n] = self._gyro[:n], self._imu.rows(0, n), self._said[:n], self._residuals[:n]
+        return self._views[n]
+
     def _room(self, n: int) -> None:
-        self._imu = ImuIncrements.empty(n)
-        self._gyro, self._residuals = np.zeros((n, 4)), np.zeros(n)
+        self._views.clear()
+        self._imu, self._gyro = ImuIncrements.empty(n), np.zeros((n, 4))
+        self._said, self._residuals = np.zeros(n, np.int64), np.zeros(n)
 
 
 def _words(fault: Fault) -> str:

@@ -49,11 +49,11 @@ def feed(ring: Ring, duration_s: float, device_s: float, mode: Mode) -> float:
     return device_s
 
 
-def start(url: str) -> tuple[Any, Ring, Wake, Any]:
+def start(url: str, **config: Any) -> tuple[Any, Ring, Wake, Any]:
     spawn = get_context("spawn")
     ring, stop = Ring(NAV_STATE, 1024, 1), Wake()
     report, report_end = spawn.Pipe()
-    arguments = (MavlinkConfig(links=(url,)), Taps(ring, 0, Ring(EVENTS, 16, 0), Control()), stop, report_end)
+    arguments = (MavlinkConfig(links=(url,), **config), Taps(ring, 0, Ring(EVENTS, 16, 0), Control()), stop, report_end)
     process = spawn.Process(target=run_publisher, args=arguments)
     process.start()
     report_end.close()
@@ -96,7 +96,7 @@ def test_mavproxy_is_content(tmp_path: Path) -> None:
     assert "link 1 OK" in output
     assert "0.0% loss" in output
     assert "Detected vehicle 1:1" in output
-    assert "Received 18 parameters" in output
+    assert "Received 19 parameters" in output
     assert "SYSID_THISMAV" in output
     assert "online system 1" in output
     for warning in (

@@ -137,7 +137,17 @@ def test_two_programs_lose_nothing(start: Start, tmp_path: Path, layout: str, ra
     assert sent == {"scenario": "can", "sent": 4 * rate_hz, "dropped": 0}
     assert summary["samples"] == 4 * rate_hz
     assert summary["frames"] == 4 * rate_hz * (1 if layout == "fd" else 6) + 4 * 5
-    for name in ("lost", "duplicated", "late", "crc_errors", "foreign", "short", "version_errors", "restarts"):
+    for name in (
+        "lost",
+        "duplicated",
+        "late",
+        "crc_errors",
+        "foreign",
+        "short",
+        "version_errors",
+        "restarts",
+        "overflowed",
+    ):
         assert summary[name] == 0, name
     assert summary["error"]["position_m"]["max"] < 1e-3
     assert "problem" not in summary

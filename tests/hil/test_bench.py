@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil.bench import aided, attitude, strapdown
+from hil.bench import aided, attitude, receive, strapdown
 from hil.bench.strapdown import StrapdownRecord, c_two_sample
 from hil.bench.timing import Sizes, Work, paired_ratio, rows_in_turns
 from nav.strapdown import MECHANIZATIONS, Strapdown
@@ -81,6 +81,15 @@ def test_works_take_turns():
 def test_a_missing_peer_leaves_no_trace():
     (row,) = rows_in_turns([Work("a", "a", lambda: None, 1, "absent", "b", "c")], 2)
     assert (row["peer"], row["peer_ns"], row["ratio_to_c"]) == ("", None, None)
+
+
+@pytest.mark.socketcan
+def test_receiving_has_its_rows_beside_python_can():
+    rows = {row["id"]: row for row in receive.rows(SMALL)}
+    for layout in receive.LAYOUTS:
+        ours, theirs = rows[f"receive-socketcan-{layout}"], rows[f"receive-python-can-{layout}"]
+        assert (ours["peer"], theirs["peer"]) == ("python-can", "")
+        assert 0.0 < ours["ns"] < theirs["ns"]
 
 
 def test_the_aided_loop_has_its_rows_and_every_measurement_is_taken():

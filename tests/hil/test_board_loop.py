@@ -6,11 +6,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from drivers import make_emulator
 from drivers.can.unix_bus import UnixPort
 from hil.bridge import Loop, LoopOrder, Outlets
 from hil.scenario import Scenario
 from hil.world.head import SimulatedHead
 from nav.errors import HilError
+from nav.increments import ImuIncrements
+from nav.rotation import euler_from_quaternion
+from nav.state import NAV_STATE, Mode
 
 ALIGN_S, REST_S, END_S = 5.0, 8.0, 28.0
 BOARDS = {  # sample rate, one step of the rates and of the specific force
@@ -77,6 +81,29 @@ def test_a_board_that_stands_turned_in_the_vehicle():
     assert found["mode"] == "navigate"
     for name in ("attitude_deg", "velocity_ms"):
         assert found["error"][name]["max"] == pytest.approx(expected["error"][name]["max"], abs=0.2)
+
+
+def test_the_gyro_bias_of_a_board_at_rest_is_captured_at_the_start():
+    """What it turns by at rest, but for the Earth's rate, is bias (whole steps of the wire here), taken off from then on."""
+    chosen, bias_deg_s = scenario("j1939-imu").with_changes(duration_s=20.0), np.array([0.5, -1.25, 2.0])
+    imu = ImuIncrements.empty(2000)
+    imu.step[:], imu.time[:], imu.sequence[:] = 0.01, 0.01 * np.arange(1, 2001), np.arange(2000)
+    imu.dtheta[:], imu.dvel[:, 2] = 0.01 * np.radians(bias_deg_s), -0.0981
+    emulator = make_emulator("j1939-imu", 10_000)
+    outlets = Outlets.make(recording=False, readers=1)
+    loop = Loop(LoopOrder(chosen, paced=False), outlets)
+    loop.take(np.concatenate([emulator.slow(), emulator.samples(imu)]))
+    north, heading = (
+        15.041067 * math.cos(math.radians(50.0)),
+        math.radians(40.0),
+    )  # deg/h, of a level board at 50 deg north
+    earth = [north * math.cos(heading), -north * math.sin(heading), -15.041067 * math.sin(math.radians(50.0))]
+    np.testing.assert_allclose(loop.result()["gyro_bias_deg_h"], 3600.0 * bias_deg_s - earth, atol=1e-3)
+    rows = np.zeros(1, NAV_STATE)
+    assert outlets.states.latest(rows)
+    assert rows["mode"][0] == Mode.NAVIGATE
+    turned_deg = np.degrees(np.abs(euler_from_quaternion(rows["q_nb"][0]) - np.radians([40.0, 0.0, 0.0])))
+    assert turned_deg.max() < 0.1, "15 s at 2 deg/s would be 30 deg"
 
 
 def test_instruments_of_the_dtg_head_are_not_those_of_a_board():

@@ -27,6 +27,8 @@ COMMANDS = (
     "navigate",
     "decode",
     "record",
+    "monitor",
+    "check-axes",
     "calibrate",
     "configure",
     "doctor",

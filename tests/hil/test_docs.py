@@ -19,7 +19,7 @@ from drivers.can.dtg_head import head_database_text
 from drivers.can.integrity import protection
 from drivers.mavlink.messages import KINDS
 from hil.cli import app
-from hil.scenario import Channel, Cone, Scenario
+from hil.scenario import Channel, Cone, LinkConfig, Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -34,6 +34,7 @@ def model_rows() -> Rows:
     rows: Rows = {}
     walk(Scenario, "", rows)
     walk(Channel, "CHANNEL.", rows)
+    walk(LinkConfig, "LINK.", rows)
     return rows
 
 

@@ -161,6 +161,7 @@ def test_start_is_read(tmp_path):
         (GOOD.replace("lat_deg = 1", "lat_deg = nan"), "lat_deg = nan"),
         (GOOD.replace("lat_deg = 1", "lat_deg = true"), "lat_deg = True"),
         (GOOD + "\nspeed = 1", "unknown key 'speed'"),
+        (GOOD.replace("lat_deg = 1", f"lat_deg = {10**400}"), "expected a number"),
         ("lat_deg = = 1", "not TOML"),
     ],
 )

@@ -152,7 +152,7 @@ def test_home_is_where_navigation_began(running: Running) -> None:
 
 
 def test_a_request_to_align_reaches_the_loop(running: Running) -> None:
-    until(running.hear)
+    until(lambda: "ATTITUDE" in types(running.feed(0.1)))
     command = mav.MAVLink_command_long_message(1, 1, mav.MAV_CMD_PREFLIGHT_CALIBRATION, 0, 1, 0, 0, 0, 0, 0, 0)
     running.client.sendto(command.pack(running.mav), running.address)
     heard: list[Any] = []
@@ -199,6 +199,8 @@ def test_every_link_is_served() -> None:
         return len(clients) == 2
 
     until(connected)
+    for client in clients:
+        assert client.recv(1, socket.MSG_PEEK)  # the publisher is at work
     running.feed(3.0)
     for client in clients:
         heard = mav.MAVLink(None).parse_buffer(client.recv(65536))

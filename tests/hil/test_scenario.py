@@ -54,6 +54,9 @@ def test_the_default_needs_nothing():
         ("seed = -1", ["seed", "-1"]),
         ('motion = "fast"', ["motion", "'fast'"]),
         ("[motion", ["not TOML"]),
+        ("seed = " + "9" * 5000, ["not TOML", "digits"]),
+        ("seed = 0x" + "f" * 5000, ["not TOML", "digits"]),
+        ("seed = " + "[" * 5000, ["not TOML", "recursion"]),
         ("name = 1\nspeed = 2", ["name", "speed"]),
     ],
 )

@@ -1,5 +1,6 @@
 """Frames from a file or a bus behind one `receive`."""
 
+import re
 import time
 from contextlib import closing
 
@@ -7,7 +8,7 @@ import can
 import numpy as np
 import pytest
 
-from drivers.can.convert import to_message
+from drivers.can.convert import from_message, to_message
 from drivers.can.frames import BRS, EFF, FDF, frames
 from drivers.can.unix_bus import UnixPort
 from drivers.logs.recording import RecordingWriter
@@ -114,3 +115,27 @@ def test_a_bus_is_a_source(tmp_path_factory, monkeypatch, paced):
         assert source.problem() == ""
     with pytest.raises(HilError):
         BusSource("nowhere", paced=paced)
+
+
+@pytest.mark.parametrize("size", [0, 16, 31])
+def test_an_object_without_length_does_not_hold_a_blf_file_up(tmp_path, size):
+    """python-can's reader alone goes round for ever at it."""
+    path = tmp_path / "a.blf"
+    with can.BLFWriter(path, compression_level=0) as logger:
+        for row in numbered(10):
+            logger.on_message_received(to_message(row, "can0"))
+    data = bytearray(path.read_bytes())
+    at = [found.start() for found in re.finditer(b"LOBJ", data)][6]  # the container, and five frames
+    data[at + 8 : at + 12] = size.to_bytes(4, "little")
+    path.write_bytes(data)
+    with closing(FileSource(path, paced=False)) as source:
+        assert len(drained(source)) == 5
+        assert f"an object of {size} bytes" in source.problem()
+
+
+def test_a_remote_frame_asks_for_no_more_than_a_frame_holds():
+    message = can.Message(arbitration_id=1, is_remote_frame=True, dlc=8)
+    message.dlc = 200
+    row = frames(1)[0]
+    from_message(message, row)
+    assert row["length"] == 8

@@ -4,7 +4,8 @@ const $ = (id) => document.getElementById(id);
 const MESSAGES = 200;
 const LOSS_NAMES = {
   lost: "lost", duplicated: "duplicated", late: "late", crc_errors: "bad check", foreign: "foreign", short: "short",
-  version_errors: "version", restarts: "restarts", interpolated: "made up", silences: "silences", recorder_lost: "recorder",
+  version_errors: "version", restarts: "restarts", frozen: "frozen", clock_steps: "clock steps",
+  interpolated: "made up", silences: "silences", recorder_lost: "recorder",
 };
 
 export function put(id, text) {
@@ -119,8 +120,8 @@ function showLinks({ links, sent_hz: sent }) {
   while (body.rows.length > links.length) body.deleteRow(-1);
   links.forEach((link, k) => {
     const row = body.rows[k] ?? body.insertRow();
-    if (!row.cells.length) row.append(made("th"), made("td"), made("td"), made("td"), made("td"));
-    [link.url, link.sent_hz.toFixed(0), link.received, link.bad, link.dropped].forEach((value, i) =>
+    if (!row.cells.length) row.append(made("th"), ...Array.from({ length: 6 }, () => made("td")));
+    [link.url, link.sent_hz.toFixed(0), link.received, link.refused, link.bad, link.dropped, link.lost].forEach((value, i) =>
       put(row.cells[i], String(value)));
   });
   facts($("sent"), Object.entries(sent).map(([name, rate]) => [name, `${rate.toFixed(rate < 9.5 ? 1 : 0)} Hz`]));

@@ -272,6 +272,16 @@ def test_the_sbg_messages_decode_as_cantools(hil_data):
             assert_decodes_as_cantools(message, database[message.name], rng.integers(0, 256, 64).tolist())
 
 
+@pytest.mark.parametrize("path", sorted(HEAD_DBC.parent.glob("*.dbc")), ids=lambda path: path.stem)
+def test_every_message_that_is_shipped_decodes_as_cantools(path):
+    reference, database = cantools.database.load_file(path), load_database(path)
+    assert not database.refused
+    rng = np.random.default_rng(8)
+    for message in reference.messages:
+        for _ in range(20):
+            assert_decodes_as_cantools(message, database[message.name], rng.integers(0, 256, 64).tolist())
+
+
 # The head's own message set, as a head's maker would write it down.
 
 

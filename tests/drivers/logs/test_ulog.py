@@ -211,3 +211,11 @@ def test_what_shakes_is_told_from_what_moves(averaged):
     log = make_log(time_us, values, values, time_us, np.tile([1.0, 0, 0, 0], (len(t), 1)), [])
     expected = 0.2 * np.sqrt(0.5 if averaged else 1.0)
     assert log.shake(log.rate) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("column", ["timestamp", "baro_timestamp_relative", "gyro_rad"])
+def test_a_topic_without_its_column_is_named(tmp_path, column):
+    path = made(tmp_path / "odd.ulg", base(15))
+    path.write_bytes(path.read_bytes().replace(column.encode(), b"x" * len(column), 1))
+    with pytest.raises(HilError, match=r"odd\.ulg: .*column|odd\.ulg: it has no topic"):
+        read_ulog(path)

@@ -16,7 +16,6 @@ from drivers.mavlink.aiding import (
     FROM_ANYONE,
     FROM_MASTER,
     MASTER,
-    OPERATOR,
     VISION,
     Place,
     Refused,
@@ -24,7 +23,7 @@ from drivers.mavlink.aiding import (
     operator_position,
 )
 from drivers.mavlink.solution import Home, geodetic
-from nav.aiding import RELAYED, Kind
+from nav.aiding import OPERATOR, RELAYED, Kind
 
 GEOID_M = 25.0
 HOME = Home(math.radians(50.0), math.radians(36.25), 150.0)

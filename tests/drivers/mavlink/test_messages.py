@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 from scipy.spatial.transform import Rotation
 
-from drivers.mavlink.messages import KINDS, Situation
+from drivers.mavlink.messages import KINDS, ClockReading, Situation
 from drivers.mavlink.solution import Home, Solution
 from nav.rotation import quaternion_from_euler
 from nav.state import NAV_STATE, Health, Mode
@@ -20,6 +20,7 @@ EARTH_RATE = 7.292115e-5
 GEOID_M = 25.0
 SIGMA = (0.3, 0.4, 0.7, 0.03, 0.02, 0.05, 1e-3, 2e-3, 3e-3)
 COVARIANCES = {"pose_covariance", "velocity_covariance"}
+NAMES = {"name"}
 """Fields in which NaN says "unknown"."""
 DIAGONAL = [k for k, (i, j) in enumerate(zip(*np.triu_indices(6), strict=True)) if i == j]
 
@@ -50,7 +51,7 @@ def solution(**changes: Any) -> Solution:
 
 
 HOME = Home(math.radians(50.0), math.radians(36.25), 150.0)
-SITUATION = Situation(home=HOME, lost=1, samples=999)
+SITUATION = Situation(home=HOME, lost=1, samples=999, clock=ClockReading(10**18, -12.5, 3.0, 2))
 
 
 def over_the_wire(message: Any) -> Any:
@@ -73,7 +74,7 @@ def test_every_message_survives_the_wire(name: str) -> None:
     for field in message.get_fieldnames():
         value = getattr(message, field)
         values = value if isinstance(value, list) else [value]
-        assert field in COVARIANCES or all(math.isfinite(v) for v in values), field
+        assert field in COVARIANCES | NAMES or all(math.isfinite(v) for v in values), field
 
 
 @pytest.mark.parametrize(
@@ -253,9 +254,18 @@ def test_altitudes_agree_with_each_other() -> None:
 
 def test_time_is_device_time_and_wraps() -> None:
     assert decoded("ATTITUDE", time=2.0**32 / 1e3 + 1.5).time_boot_ms == 1500
-    message = decoded("SYSTEM_TIME")
+    message = decoded("SYSTEM_TIME", Situation())
     assert (message.time_unix_usec, message.time_boot_ms) == (1_700_000_000_123_456, 12345)
     assert decoded("HIGHRES_IMU").time_usec == 12_345_000
+
+
+def test_compared_clocks_give_the_time_of_the_host() -> None:
+    """Not the arrival of one sample, which may have waited."""
+    message = decoded("SYSTEM_TIME", time=12.345)
+    assert (message.time_unix_usec, message.time_boot_ms) == (1_000_000_012_345_000, 12345)
+    message = decoded("DEBUG_VECT", time=12.345)
+    assert (message.name, message.time_usec) == ("CLOCK", 12_345_000)
+    assert (message.x, message.y, message.z) == (-12.5, 3.0, 2.0)
 
 
 def test_no_satellite_receiver_is_pretended() -> None:
@@ -284,7 +294,7 @@ vectors = st.tuples(numbers, numbers, numbers)
     q_nb=st.one_of(st.tuples(numbers, numbers, numbers, numbers), st.just((0.6, 0.0, 0.8, 0.0))),
 )  # fmt: skip
 def test_nonsense_is_left_out_and_never_sent(**fields: Any) -> None:
-    situation = Situation(home=HOME, lost=2**40, samples=-1)
+    situation = Situation(home=HOME, lost=2**40, samples=-1, clock=ClockReading(2**62, -1e9, 1e9, 2**40))
     for kind in KINDS.values():
         message = kind.build(solution(**fields), situation)
         if message is None:
@@ -293,5 +303,5 @@ def test_nonsense_is_left_out_and_never_sent(**fields: Any) -> None:
         for field in message.get_fieldnames():
             value = getattr(message, field)
             values = value if isinstance(value, list) else [value]
-            assert field in COVARIANCES or all(math.isfinite(v) for v in values), field
-            assert not any(math.isinf(v) for v in values), field
+            assert field in COVARIANCES | NAMES or all(math.isfinite(v) for v in values), field
+            assert field in NAMES or not any(math.isinf(v) for v in values), field

@@ -58,7 +58,7 @@ def test_increments_come_out_as_they_went_in(name: str) -> None:
     assert (np.diff(got.sequence) == 1).all()
     assert not got.validity.any()
     assert driver.counters.frames == len(batch)
-    assert driver.counters.as_list()[2:] == [0] * 8
+    assert driver.counters.as_list()[2:] == [0] * (len(driver.counters.as_list()) - 2)
     assert driver.identity()["skipped_bytes"] == 0
     assert driver.period_s == pytest.approx(STEP_S)
     checked: FrameDriver = driver

@@ -128,3 +128,10 @@ def test_the_configured_packet_is_the_emulators() -> None:
     assert found is not None
     assert found.length == len(packet)
     assert np.frombuffer(packet, "<f4", 3, found.push)[2] < 0.0  # gravity pulls a level board: specific force is up
+
+
+def test_layouts_that_are_remembered_are_few() -> None:
+    """There are 2^112 headers: a line of rubbish may not fill the memory."""
+    for mask in range(2000):
+        layout(b"\x01" + struct.pack("<H", mask))
+    assert layout.cache_info().currsize < 1000

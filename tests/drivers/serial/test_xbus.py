@@ -124,7 +124,7 @@ def test_counter_and_clock_turn_over() -> None:
     packets = XbusEmulator(first=65500).packets(sent)
     got = decoded(driver, to_chunks(b"".join(packets)))
     assert len(got) == 299
-    assert driver.counters.as_list()[2:] == [0] * 8
+    assert driver.counters.as_list()[2:] == [0] * (len(driver.counters.as_list()) - 2)
     np.testing.assert_allclose(np.diff(got.time), STEP_S, atol=1e-6)
     assert (np.diff(got.sequence) == 1).all()
 

@@ -1,0 +1,149 @@
+"""Rows of `NAV_STATE` as the navigator fills them: one buffer, its fields handed to kernels, nothing made per sample."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nav.increments import FloatArray, ImuIncrements, IntArray
+from nav.kernel import kernel
+from nav.state import NAV_STATE
+from nav.strapdown import Answers
+
+StateArray = NDArray[Any]
+_STATE = ("mode", "health", "progress", "lat", "lon", "height", "vel_n", "q_nb", "gyro_bias", "sigma", "test_ratio")
+_SAMPLE = ("time", "sequence", "gyro_bias", "w_ib_b", "f_b")
+
+
+@kernel
+def _fill(
+    mode: NDArray[np.int32],
+    health: NDArray[np.int32],
+    progress: FloatArray,
+    lat: FloatArray,
+    lon: FloatArray,
+    height: FloatArray,
+    vel_n: FloatArray,
+    q_nb: FloatArray,
+    gyro_bias: FloatArray,
+    sigma: NDArray[np.float32],
+    test_ratio: NDArray[np.float32],
+    start: int,
+    stop: int,
+    what: tuple[int, int, float],
+    position: FloatArray,
+    velocity: FloatArray,
+    attitude: FloatArray,
+    bias: FloatArray,
+    sigmas: NDArray[np.float32],
+    ratios: NDArray[np.float32],
+) -> None:
+    for k in range(start, stop):
+        i = min(k - start, position.shape[0] - 1)
+        mode[k], health[k], progress[k] = what
+        lat[k], lon[k], height[k] = position[i, 0], position[i, 1], position[i, 2]
+        for j in range(3):
+            vel_n[k, j], gyro_bias[k, j] = velocity[i, j], bias[j]
+        for j in range(4):
+            q_nb[k, j] = attitude[i, j]
+        for j in range(sigmas.shape[0]):
+            sigma[k, j] = sigmas[j]
+        for j in range(ratios.shape[0]):
+            test_ratio[k, j] = ratios[j]
+
+
+@kernel
+def _add_samples(
+    times: FloatArray,
+    sequences: IntArray,
+    gyro_bias: FloatArray,
+    w_ib_b: FloatArray,
+    f_b: FloatArray,
+    time: FloatArray,
+    step: FloatArray,
+    dtheta: FloatArray,
+    dvel: FloatArray,
+    sequence: IntArray,
+) -> None:
+    for i in range(time.shape[0]):
+        k = i + 1
+        times[k], sequences[k] = time[i], sequence[i]
+        t = step[i] if step[i] > 0.0 else 1.0
+        for j in range(3):
+            w_ib_b[k, j] = dtheta[i, j] / t - gyro_bias[k, j]
+            f_b[k, j] = dvel[i, j] / t
+
+
+class Solutions:
+    """Room for the rows of a batch; row 0 of the buffer is the last one of the batch before."""
+
+    def __init__(self) -> None:
+        self._room(256)
+
+    @property
+    def last(self) -> StateArray:
+        """(1,) The last row that was kept; to be changed in place."""
+        return self._rows[:1]
+
+    def room(self, n: int) -> StateArray:
+        """(n,) rows to be filled; valid until there is more to fill."""
+        if n + 1 > len(self._rows):
+            before = self._rows[0].copy()
+            self._room(2 * n + 1)
+            self._rows[0] = before
+        rows = self._views.get(n)
+        if rows is None:
+            rows = self._views[n] = self._rows[1 : n + 1]
+        return rows
+
+    def answers(self, n: int) -> Answers:
+        """Room for the place, velocity and attitude of `n` samples; valid until there is more to fill."""
+        self.room(n)
+        answers = self._answers.get(n)
+        if answers is None:
+            answers = self._answers[n] = Answers(*(array[:n] for array in self._scratch))
+        return answers
+
+    def fill(
+        self,
+        start: int,
+        stop: int,
+        what: tuple[int, int, float],
+        answers: Answers,
+        gyro_bias: FloatArray,
+        worth: tuple[NDArray[np.float32], NDArray[np.float32]],
+    ) -> None:
+        """Fill the rows `start` to `stop` but for what comes from the samples alone.
+
+        Parameters
+        ----------
+        start, stop : int
+            Of `room`.
+        what : tuple
+            Mode, health, progress.
+        answers : Answers
+            Beyond its rows the last one is repeated.
+        gyro_bias : (3,) float
+            rad/s.
+        worth : tuple of (9,), (len(Ratio),) float32
+            Sigmas and test ratios.
+        """
+        arguments: Any = (*self._state, start + 1, stop + 1, what, *answers, gyro_bias, *worth)
+        _fill(*arguments)
+
+    def add_samples(self, imu: ImuIncrements) -> None:
+        """Time, number, rate and force of every row, from samples from which the bias is not taken off yet."""
+        arguments: Any = (*self._sample, imu.time, imu.step, imu.dtheta, imu.dvel, imu.sequence)
+        _add_samples(*arguments)
+
+    def keep_last(self, n: int) -> None:
+        """The last of `n` rows is what `last` gives."""
+        self._rows[0] = self._rows[n]
+
+    def _room(self, n: int) -> None:
+        self._rows = np.zeros(n, NAV_STATE)
+        self._scratch = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
+        self._views: dict[int, StateArray] = {}
+        self._answers: dict[int, Answers] = {}
+        self._state = tuple(self._rows[name] for name in _STATE)
+        self._sample = tuple(self._rows[name] for name in _SAMPLE)

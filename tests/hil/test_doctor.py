@@ -1,0 +1,83 @@
+"""`hil doctor`: ports and interfaces are listed with their state, and the board on them is recognised."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import hil
+from serial.tools.list_ports_common import ListPortInfo
+
+from drivers import make_emulator
+from drivers.can.bus import open_port
+from nav.increments import ImuIncrements
+
+
+def findings(*arguments: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(hil("doctor", *arguments, "--json")[0])["findings"]
+    return found
+
+
+def named(what: str, *arguments: str) -> list[dict[str, Any]]:
+    return [finding for finding in findings(*arguments) if finding["what"] == what]
+
+
+def test_serial_ports_are_listed_by_name_and_description(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    ours, theirs = os.openpty()
+    there = ListPortInfo(os.ttyname(theirs), skip_link_detection=True)
+    there.description = "IMU of the desk"
+    gone = ListPortInfo(str(tmp_path / "ttyGone"), skip_link_detection=True)
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [gone, there])
+    (ports,) = named("serial ports")
+    assert f"{there.device} (IMU of the desk)" in ports["found"]
+    assert [one["verdict"] for one in named(gone.device)] == ["lack"], "one that we may not open"
+    assert named(there.device) == [], "one that we may, without --probe"
+    os.close(theirs)
+    os.close(ours)
+
+
+def test_each_extra_names_its_mend() -> None:
+    """In an installation that has none of them."""
+    project = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text()
+    extras = {"pyulog": "logs", "matplotlib": "plot", "pyarrow": "parquet"}
+    script = (
+        "import importlib.util as u, json, hil.doctor as d; found = u.find_spec\n"
+        f"u.find_spec = lambda name: None if name in {tuple(extras)} else found(name)\n"
+        "print(json.dumps([one.mend for one in d._extras()]))"
+    )
+    said = subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout
+    assert json.loads(said) == [f"pip install 'dtg-hil[{extra}]'" for extra in extras.values()]
+    for module, extra in extras.items():
+        assert f'{extra} = ["{module}' in project
+
+
+@pytest.mark.socketcan
+def test_a_can_interface_has_a_state_and_a_board() -> None:
+    assert named("vcan0") == [{"what": "vcan0", "verdict": "ok", "found": "up, mtu 72", "mend": ""}]
+    imu, ended = ImuIncrements.empty(2000), threading.Event()
+    imu.step[:], imu.time[:], imu.sequence[:] = 0.01, 0.01 * np.arange(1, 2001), np.arange(2000)
+    imu.dvel[:, 2] = -0.0981
+    emulator = make_emulator("xsens-can", 10_000)
+    batch = emulator.samples(imu)
+
+    def feed() -> None:
+        port = open_port("socketcan:vcan0", listen=False)
+        for start in range(0, len(batch), 40):
+            port.send(batch[start : start + 40].copy())
+            if ended.wait(0.05):
+                break
+        port.close()
+
+    thread = threading.Thread(target=feed)
+    thread.start()
+    try:
+        found = named("vcan0", "--probe")
+    finally:
+        ended.set()
+        thread.join()
+    assert [one["found"] for one in found] == ["up, mtu 72", "hil run --imu xsens-can --bus socketcan:vcan0"]
