@@ -30,6 +30,8 @@ from drivers.logs.recording import EVENT, MARK, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
 from hil.clock import LoopClock
 from hil.control import Control
+from hil.feed.quantisation import warnings
+from hil.feed.tap import Gate
 from hil.health import HEALTH, HealthWriter
 from hil.magnetometer import correct
 from hil.other_attitude import Estimator, OtherAttitude
@@ -113,6 +115,8 @@ class Outlets:
     """What the loop says of the sensor a few times a second: of `hil.health.HEALTH`."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
+    gate: Gate | None = None
+    """In simulated time with feeds: no solution is overwritten before they have it."""
 
     @staticmethod
     def make(*, recording: bool, readers: int, receivers: int = 0) -> "Outlets":
@@ -175,6 +179,9 @@ class Loop:
         self._health = HealthWriter(outlets.health, self._combiner)
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
+        for feed in scenario.feed:
+            for text in warnings(feed, scenario):
+                self.navigator.tell(0.0, "warning", text)
 
     def take(self, batch: FrameArray) -> bool:
         """Decode and navigate a batch of frames; True when it held a sample."""
@@ -468,6 +475,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
     relayed, relayed_numbers = frames(BATCH), [0] * len(outlets.aiding)
     trouble = ""
     while not (control.stop or loop.finished or source.exhausted):
+        if outlets.gate is not None:
+            outlets.gate.wait(outlets.states, outlets.states.capacity // 2, lambda: control.stop)
         n = source.receive(batch, wait)
         now = time.monotonic_ns()
         stats["beat_ns"] = now
@@ -504,6 +513,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
         if event:
             _record(event_record(event, time.time_ns()), outlets, order.paced)
             loop.obey(event)
+    if outlets.gate is not None:
+        outlets.gate.wait(outlets.states, 0, lambda: control.stop)
 
 
 def take_with_events(loop: Loop, taken: FrameArray) -> bool:

@@ -44,6 +44,10 @@ Links = Annotated[
     list[str] | None,
     typer.Option("--mavlink", help="udpout:HOST:PORT, udpin:, tcp:, tcpin:, serial:DEV:BAUD, or none."),
 ]
+Feeds = Annotated[
+    list[str] | None,
+    typer.Option("--feed", help="Autopilot: ardupilot-json:HOST:PORT, px4:HOST:PORT, vectornav:pty or :tcp:HOST:PORT."),
+]
 Key = Annotated[
     Path | None, typer.Option("--mavlink-key", help="Sign MAVLink with the key in this file, take nothing unsigned.")
 ]
@@ -77,6 +81,7 @@ def run(
         list[str] | None, typer.Option(help="Port of a satellite receiver, serial:/dev/ttyACM0:115200; repeatable.")
     ] = None,
     mavlink: Links = None,
+    feed: Feeds = None,
     duration: Duration = None,
     speed: Speed = "1",
     seed: Seed = None,
@@ -98,7 +103,7 @@ def run(
     from hil.session import simulated_head
 
     chosen = load(scenario).with_changes(
-        **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink)
+        **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink, feed=feed)
     )
     if gnss:
         chosen = chosen.with_receivers(gnss)
@@ -163,6 +168,7 @@ def replay(
     scenario: Annotated[str | None, typer.Option(help="Scenario instead of the one in the recording.")] = None,
     bus: Bus = None,
     mavlink: Links = None,
+    feed: Feeds = None,
     speed: Speed = "1",
     record: Record = None,
     realtime: Realtime = False,
@@ -190,7 +196,7 @@ def replay(
     from hil.player import plan_replay, run_player
 
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
-    changed = order.scenario.with_changes(**_changes(mavlink=mavlink, withhold=withhold))
+    changed = order.scenario.with_changes(**_changes(mavlink=mavlink, feed=feed or [], withhold=withhold))
     order = replace(order, scenario=_links(changed, mavlink_key, tlog), realtime=realtime)
     if plot is not None:
         if order.reference is None:
@@ -598,6 +604,8 @@ def _run(
         while not (session.ready or stop.wanted):
             view.show_compiling()
             time.sleep(0.1)
+        for place in session.feed_places():
+            _say(f"an autopilot finds its feed at {place}")
         try:
             _follow(session, stop, view)
         except HilError as error:
@@ -664,8 +672,17 @@ def _links(scenario: "Scenario", key: Path | None, tlog: Path | None) -> "Scenar
     return chosen
 
 
-def _changes(mavlink: list[str] | None = None, withhold: list[str] | None = None, **options: Any) -> dict[str, Any]:
+def _changes(
+    mavlink: list[str] | None = None,
+    withhold: list[str] | None = None,
+    feed: list[str] | None = None,
+    **options: Any,
+) -> dict[str, Any]:
     changes = {key: value for key, value in options.items() if value is not None}
+    if feed is not None:
+        from hil.feed.config import parse_feed
+
+        changes["feed"] = [parse_feed(text) for text in feed]
     if withhold:
         changes["navigation"] = {"filter": {"withheld": [_outage(text) for text in withhold]}}
     if mavlink:

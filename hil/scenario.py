@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from hil.feed.config import FeedConfig
 from hil.toml import parse_toml
 from hil.wire_config import WireFault
 from nav.alignment.axes import matrix, rotation
@@ -459,6 +460,8 @@ class Scenario(_Model):
     receiver: Annotated[tuple[ReceiverConfig, ...], Field(max_length=16)] = ()
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
+    feed: tuple[FeedConfig, ...] = ()
+    """Autopilots that are given the solution (:mod:`hil.feed`)."""
 
     @model_validator(mode="after")
     def _carried(self) -> "Scenario":

@@ -1,6 +1,6 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
-    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, dashboard, this process
+    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, feeds, dashboard, this process
                                 receivers --rings--^
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
@@ -10,7 +10,7 @@ import contextlib
 import multiprocessing as mp
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -24,6 +24,7 @@ from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.clock import clock_summary
 from hil.control import READERS, run_part
 from hil.dashboard import Sources, Window, recording_name, run_dashboard
+from hil.feed.group import FeedGroup
 from hil.link_stats import LinkStats
 from hil.mcap_recorder import run_mcap
 from hil.publisher import Taps, link_options, run_publisher
@@ -109,8 +110,11 @@ class Session:
         self.recordings: list[dict[str, Any]] = []
         """What became of the recordings that were asked for while running."""
         self._window = window
+        self.feeds = FeedGroup(order.scenario, paced=order.paced)
         self._receivers = {f"receiver {k}": one for k, one in enumerate(order.scenario.receiver if order.live else ())}
-        self.outlets = Outlets.make(recording=record is not None, readers=1, receivers=len(self._receivers))
+        readers = 1 + len(self.feeds.names)
+        outlets = Outlets.make(recording=record is not None, readers=readers, receivers=len(self._receivers))
+        self.outlets = replace(outlets, gate=self.feeds.gate)
         self._feeder = feeder
         self._record = record
         self._publish = publish
@@ -189,6 +193,7 @@ class Session:
             shared = outlets.stats, outlets.fixes, self.links
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
+        self.feeds.launch(launch, outlets.states, 1)
         for k, (name, config) in enumerate(self._receivers.items()):
             launch(name, run_receiver, config, k, outlets.stats, outlets.aiding[1 + k], outlets.control)
 
@@ -212,6 +217,8 @@ class Session:
             return True
         heralds = [part for name, part in self._parts.items() if name in {"recorder", "mcap", *self._receivers}]
         if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in heralds):
+            return False
+        if len(self.feed_places()) < len(self.feeds.names):
             return False
         self._began = time.monotonic()
         self.outlets.control.order_go()
@@ -307,6 +314,13 @@ class Session:
             for row in rows[:copied]
         ]
 
+    def feed_places(self) -> list[str]:
+        """Where the autopilots find the feeds that listen."""
+        return [feed["place"] for feed in self._feed_summaries() if "place" in feed]
+
+    def _feed_summaries(self) -> list[_Answers]:
+        return self.feeds.summary({name: part.answers for name, part in self._parts.items()})
+
     def stop(self) -> None:
         """Tell the loop to end."""
         self.outlets.control.order_stop()
@@ -326,6 +340,8 @@ class Session:
                 raise HilError(str(failed))
             if failed not in self.problems:
                 self._note(str(failed), "error", problem=True)
+                if part.name in self.feeds.names:
+                    self.feeds.gone(part.name)
         for name in READERS:
             self._look_at(name)
 
@@ -357,12 +373,23 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "mcap", "publisher", *self._receivers, "dashboard"):
+        for name in (
+            "loop",
+            "feeder",
+            "recorder",
+            "mcap",
+            "publisher",
+            *self._receivers,
+            *self.feeds.names,
+            "dashboard",
+        ):
             part = self._parts.get(name)
             if part is None:
                 continue
             if name == "publisher":
                 self._publisher_stop.call()
+            elif name in self.feeds.names:
+                self.feeds.stop(name)
             patience = RECORDER_STOP_S if name in {"recorder", "mcap"} else 0.0
             while part.process.is_alive() and time.monotonic() < deadline + patience:
                 part.read()
@@ -409,6 +436,8 @@ class Session:
                     result[name] = answers
         if self.recordings:
             result["recordings"] = self.recordings
+        if feeds := self._feed_summaries():
+            result["feeds"] = feeds
         if "wire" in result.get("feeder", {}):
             result["wire"] = result["feeder"].pop("wire")
         if self._receivers:

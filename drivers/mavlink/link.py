@@ -212,6 +212,15 @@ class StreamLink:
         """The client has left."""
         return self._channel is None and self._opener is None
 
+    @property
+    def left(self) -> bool:
+        """The other end has closed, though what it sent before may not all be read."""
+        if self._channel is None:
+            return True
+        poll = select.poll()
+        poll.register(self._channel.fileno(), select.POLLRDHUP)
+        return bool(poll.poll(0))
+
     def heard(self) -> None:
         """There is but one peer: nothing to do."""
 
@@ -303,20 +312,21 @@ class Listener:
         """The local port."""
         return int(self._server.getsockname()[1])
 
-    def accept(self, room: int) -> list[StreamLink]:
-        """Links of the clients that have come, `room` at most; the others are turned away."""
+    def accept(self, room: int, most: int = socket.SOMAXCONN) -> list[StreamLink]:
+        """Links of the next `most` clients that have come, `room` at most; the others are turned away."""
         links: list[StreamLink] = []
-        while True:
+        for _ in range(most):
             try:
                 client, _ = self._server.accept()
             except OSError:
-                return links
+                break
             if len(links) < room:
                 _tune(client)
                 links.append(StreamLink(self.url, None, client=client))
             else:
                 self.turned_away += 1
                 client.close()
+        return links
 
     def close(self) -> None:
         """Give everything back."""

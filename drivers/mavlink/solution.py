@@ -114,11 +114,15 @@ class Solution:
         """Height above mean sea level, m."""
         return self.height - self.geoid(self.lat, self.lon)
 
+    def in_body(self, v_n: Vector) -> Vector:
+        """A vector given north, east, down along the body axes."""
+        w, x, y, z = self.q_nb
+        return _rotated((w, -x, -y, -z), v_n)
+
     @cached_property
     def vel_b(self) -> Vector:
         """Velocity over the ground, body axes, m/s."""
-        w, x, y, z = self.q_nb
-        return _rotated((w, -x, -y, -z), self.vel_n)
+        return self.in_body(self.vel_n)
 
     @cached_property
     def vel_b_variance(self) -> Vector:
@@ -137,8 +141,7 @@ class Solution:
         east = self.vel_n[1] / (prime + self.height)
         north = self.vel_n[0] / (prime * (1.0 - E2) / w2 + self.height)
         turn = east * s / c if abs(c) > 1e-3 else 0.0
-        w, x, y, z = self.q_nb
-        p, q, r = _rotated((w, -x, -y, -z), (RATE * c + east, -north, -RATE * s - turn))
+        p, q, r = self.in_body((RATE * c + east, -north, -RATE * s - turn))
         return self.w_ib_b[0] - p, self.w_ib_b[1] - q, self.w_ib_b[2] - r
 
     def relative_to(self, home: Home) -> Vector:

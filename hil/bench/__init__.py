@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from hil.bench import aided, attitude, chain, instruments, receive, strapdown
+from hil.bench import aided, attitude, chain, feeds, instruments, receive, strapdown
 from hil.bench.timing import Row, Sizes
 
 
@@ -21,4 +21,5 @@ def measure(say: Callable[[str], None], sizes: Sizes | None = None) -> list[Row]
         *strapdown.rows(sizes),
         *attitude.rows(sizes),
         *instruments.rows(sizes),
+        *feeds.rows(sizes),
     ]

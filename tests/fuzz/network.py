@@ -50,6 +50,13 @@ class Wire:
         """See `Link.receive`."""
         return self.pieces.pop() if self.pieces else b""
 
+    def heard(self) -> None:
+        """See `Link.heard`."""
+
+    def gone(self) -> bool:
+        """See `Link.gone`."""
+        return False
+
     def send(self, frame: bytes) -> bool:
         """See `Link.send`."""
         self.sent.append(frame)
@@ -91,7 +98,7 @@ def mavlink() -> tuple[Callable[[bytes], None], list[bytes]]:
         for k in range(len(pieces) + 1):
             next_s = endpoint.poll(1000.0 + 0.05 * k)
             assert not np.isnan(next_s)
-            assert len(endpoint._mav.buf) <= 280, "what waits is one frame at most"
+            assert len(endpoint._parser.buf) <= 280, "what waits is one frame at most"
         assert len(endpoint.received) <= types, "counters are bounded by the message set"
         assert len(link.sent) <= 8 * len(KINDS) * (1 + len(pieces)), "one message draws a bounded answer"
         sent = mav.MAVLink(None).parse_buffer(b"".join(link.sent)) or []

@@ -49,7 +49,7 @@ class Watched(Loop):
         self.navigator.aid = aid
 
     def _take(self, batch: FrameArray) -> bool:
-        self.places += [self._samples] * (len(self.aided) - len(self.places))
+        self.places += [self.samples] * (len(self.aided) - len(self.places))
         return super()._take(batch)
 
 

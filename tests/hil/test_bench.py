@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hil.bench import aided, attitude, receive, strapdown
+from hil.bench import aided, attitude, feeds, receive, strapdown
 from hil.bench.strapdown import StrapdownRecord, c_two_sample
 from hil.bench.timing import Sizes, Work, paired_ratio, rows_in_turns
 from nav.strapdown import MECHANIZATIONS, Strapdown
@@ -101,3 +101,9 @@ def test_the_aided_loop_has_its_rows_and_every_measurement_is_taken():
     taken = {(one.channel.name, one.accepted + one.rejected) for one in navigator.health}
     assert taken == {("GNSS_POSITION", 5), ("GNSS_VELOCITY", 5), ("BARO", 10), ("MAGNETIC", 25)}
     assert len(navigator.used) == 35
+
+
+def test_the_feeds_have_a_row_for_each_lockstep():
+    rows = feeds.rows(Sizes(repeats=2, batch=1, calls=20))
+    assert [row["id"] for row in rows] == ["feed-json", "feed-px4"]
+    assert all(set(row) == KEYS and row["ns"] > 0.0 for row in rows)

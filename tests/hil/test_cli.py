@@ -107,7 +107,7 @@ BAD_TOML = "[navigation\nalign_s = 3"
         (["run", "--junit", "x.xml"], "", "--junit needs at least one --assert"),
         (["run", "--seed", "-1"], "", "--seed"),
         (["run", "--duration", "0"], "", "duration_s = 0.0"),
-        (["run", "--imu", "no-board"], "", "no driver 'no-board'; there is: dtg-head"),
+        (["run", "--imu", "no-board"], "", "no driver 'no-board'; there is: dronecan-imu, dtg-head"),
         (["run", "--bus", "can0"], "", "bus 'can0': expected INTERFACE:CHANNEL"),
         (["run", "--bus", "unix:a b"], "", "a bus name has 1 to 40 letters"),
         (["run", "--bus", "carrier-pigeon:1"], "", "bus carrier-pigeon:1: "),

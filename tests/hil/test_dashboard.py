@@ -111,8 +111,8 @@ def test_moments_states_and_truth_come(running: Running) -> None:
 
     async def look() -> list[dict[str, Any]]:
         async with connect(f"ws://{place}/live", **CLIENT) as socket:
-            links = lambda record: record["k"] == "slow" and record.get("links", [{}])[0].get("sent_hz", 0) > 0  # noqa: E731
-            return list(await records(socket, links))
+            flying = lambda one: one["k"] == "slow" and one.get("device_s", 0.0) > 3.0 and one["links"][0]["sent_hz"] > 0  # noqa: E731
+            return list(await records(socket, flying))
 
     seen = asyncio.run(look())
     assert seen[0]["k"] == "hello"

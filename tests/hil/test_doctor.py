@@ -44,7 +44,7 @@ def test_serial_ports_are_listed_by_name_and_description(monkeypatch: pytest.Mon
 def test_each_extra_names_its_mend() -> None:
     """In an installation that has none of them."""
     project = (Path(__file__).resolve().parents[2] / "pyproject.toml").read_text()
-    extras = {"pyulog": "logs", "matplotlib": "plot", "pyarrow": "parquet"}
+    extras = {"pyulog": "logs", "matplotlib": "plot", "pyarrow": "parquet", "mcap": "mcap"}
     script = (
         "import importlib.util as u, json, hil.doctor as d; found = u.find_spec\n"
         f"u.find_spec = lambda name: None if name in {tuple(extras)} else found(name)\n"

@@ -88,10 +88,10 @@ def test_filters_that_mean_nothing(text):
 
 @given(st.integers(-200, 200), st.integers(0, 2**60), st.integers(0, 2**32 - 1))
 def test_arrivals_by_an_adapters_clock_are_those_of_the_wire(ppm, begin, seed):
-    """The kernel's stamps are late by up to 5 ms, seldom by nothing; the adapter's clock begins anywhere and drifts."""
+    """The stamps of the kernel are late by up to 5 ms, every tenth by nothing; the adapter's clock begins anywhere and drifts."""
     rng, clock = np.random.default_rng(seed), AdapterClock()
     wire = 1_700_000_000_000_000_000 + 1_000_000 * np.arange(2000)
-    late = rng.integers(0, 5_000_000, 2000) * (rng.random(2000) > 0.1)
+    late = rng.integers(0, 5_000_000, 2000) * (np.arange(2000) % 10 > 0)
     adapter = begin + 1 + ((wire - wire[0]) * (1.0 + ppm * 1e-6)).astype(np.int64)
     got = np.concatenate(
         [clock.arrivals(*pair) for pair in zip(np.split(wire + late, 40), np.split(adapter, 40), strict=True)]

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import select
 import socket
 import struct
 import subprocess
@@ -21,6 +22,7 @@ from drivers.mavlink.hub import Hub
 from drivers.mavlink.link import CLIENTS, Listener, listens_beyond, open_link
 from drivers.mavlink.messages import KINDS
 from drivers.mavlink.options import LinkOptions, parse_options
+from drivers.mavlink.sole import SoleClient
 from drivers.mavlink.station import Identity, Station
 from nav.errors import HilError
 from nav.state import NAV_STATE, Mode
@@ -375,4 +377,42 @@ def test_a_listener_listens_where_it_is_told_and_nowhere_else() -> None:
     assert isinstance(link, Listener)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.2", link.port), timeout=1.0)
+    link.close()
+
+
+def test_a_server_of_one_client_lets_the_next_in_when_the_first_has_left() -> None:
+    """Also where bytes of the first are not read yet; one that comes before is turned away."""
+    listener = open_link("tcpin:127.0.0.1:0")
+    assert isinstance(listener, Listener)
+    link = SoleClient(listener)
+
+    def connected() -> socket.socket:
+        return socket.create_connection(("127.0.0.1", link.port), timeout=5.0)
+
+    def heard(wanted: bytes) -> None:
+        data, deadline = b"", time.monotonic() + 5.0
+        while wanted not in data and time.monotonic() < deadline:
+            select.select([link], [], [], 0.1)
+            data += link.receive()
+        assert data == wanted
+
+    assert not link.ready()
+    first = connected()
+    first.sendall(b"first")
+    heard(b"first")
+    with connected() as second:
+        select.select([link], [], [], 5.0)
+        assert link.receive() == second.recv(10) == b"", "turned away"
+    assert link.send(b"to the first")
+    assert first.recv(100) == b"to the first"
+    first.sendall(b"never read")
+    first.close()
+    with connected() as third:
+        third.sendall(b"third")
+        heard(b"third")
+        assert (link.connections, link.refused) == (2, 1)
+    select.select([link], [], [], 5.0)
+    assert link.receive() == b""
+    assert not link.ready()
+    assert not link.send(b"to nobody")
     link.close()
