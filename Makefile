@@ -9,6 +9,7 @@
 #   make lint                           ruff, mypy, import rules
 #   make dev                            .venv with everything that a developer needs
 #   make vcan                           install what the SocketCAN tests need on a kernel without CAN (Debian, root or sudo)
+#   make browser                        install the browser that the tests of the window need (Debian, root or sudo)
 #   make clean                          remove .venv, caches and build results
 
 SHELL := /bin/bash
@@ -16,7 +17,15 @@ PYTHON ?= python3
 ARGS ?=
 MINUTES ?= 30
 
-.PHONY: run test studies fuzz reliability soak lint dev vcan clean
+# Installs $$packages.
+define INSTALL
+[ `id -u` = 0 ] || root=sudo; \
+	echo "Installing $$packages ..."; \
+	install() { DEBIAN_FRONTEND=noninteractive $$root apt-get install -qq -y --no-install-recommends $$packages >/dev/null; }; \
+	install 2>/dev/null || { $$root apt-get update -qq && install; }
+endef
+
+.PHONY: run test studies fuzz reliability soak lint dev vcan browser clean
 .DELETE_ON_ERROR:
 
 run: .venv/.installed-run
@@ -45,12 +54,10 @@ lint: .venv/.installed-dev
 
 dev: .venv/.installed-dev
 
-.venv/.installed-run: EXTRAS = logs
-.venv/.installed-test: EXTRAS = logs,plot,magnetic,test
+.venv/.installed-run: EXTRAS = dashboard,logs
+.venv/.installed-test: EXTRAS = dashboard,logs,plot,magnetic,mcap,test
 .venv/.installed-fuzz: EXTRAS = logs,magnetic,test,fuzz
-.venv/.installed-dev: EXTRAS = logs,plot,magnetic,test,dev
-.venv/.installed-test: EXTRAS = logs,plot,magnetic,mcap,test
-.venv/.installed-dev: EXTRAS = logs,plot,magnetic,mcap,test,dev
+.venv/.installed-dev: EXTRAS = dashboard,logs,plot,magnetic,mcap,test,dev
 
 .venv/.installed-%: pyproject.toml constraints.txt | .venv/bin/pip
 	@echo "Installing dtg-hil[$(EXTRAS)] into .venv (takes a minute or so the first time) ..."
@@ -69,10 +76,11 @@ dev: .venv/.installed-dev
 vcan:
 	@packages="user-mode-linux busybox-static iproute2 kmod can-utils"; \
 	grep -qw amx_tile /proc/cpuinfo && packages="$$packages gcc libc6-dev"; \
-	[ `id -u` = 0 ] || root=sudo; \
-	echo "Installing $$packages ..."; \
-	install() { DEBIAN_FRONTEND=noninteractive $$root apt-get install -qq -y --no-install-recommends $$packages >/dev/null; }; \
-	install 2>/dev/null || { $$root apt-get update -qq && install; }
+	$(INSTALL)
+
+browser:
+	@packages="chromium fonts-dejavu-core"; \
+	$(INSTALL)
 
 clean:
 	rm -rf .venv .fuzz build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache .coverage

@@ -26,12 +26,13 @@ from numpy.typing import NDArray
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, is_aiding
 from drivers.can.frames import FrameArray, frames
-from drivers.logs.recording import EVENT, REALIGN, SILENCE, event_record
+from drivers.logs.recording import EVENT, MARK, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
 from hil.clock import LoopClock
 from hil.control import Control
 from hil.feed.quantisation import warnings
 from hil.feed.tap import Gate
+from hil.health import HEALTH, HealthWriter
 from hil.magnetometer import correct
 from hil.other_attitude import Estimator, OtherAttitude
 from hil.realtime import claim
@@ -110,9 +111,10 @@ class Outlets:
     """Frames of measurements, a ring a writer: that of the publisher, then those of the receivers."""
     fixes: Ring
     """What receivers have measured, for the publisher."""
+    health: Ring
+    """What the loop says of the sensor a few times a second: of `hil.health.HEALTH`."""
     stats: Stats = field(default_factory=Stats)
     control: Control = field(default_factory=Control)
-    recording: bool = False
     gate: Gate | None = None
     """In simulated time with feeds: no solution is overwritten before they have it."""
 
@@ -121,14 +123,16 @@ class Outlets:
         """New rings, with `readers` wake-ups for solutions and one for frames; `receivers` have one more each."""
         from drivers.can.frames import FRAME
 
-        return Outlets(
+        outlets = Outlets(
             Ring(NAV_STATE, 8192, readers),
             Ring(FRAME, 1 << 16, 1),
             Ring(EVENTS, 256, 1),
             tuple(Ring(FRAME, 1024, 0) for _ in range(1 + receivers)),
             Ring(AIDING, 64, 0),
-            recording=recording,
+            Ring(HEALTH, 16, 0),
         )
+        outlets.control.recording = recording
+        return outlets
 
 
 class Loop:
@@ -170,7 +174,9 @@ class Loop:
         self._arrival_ns = 0
         self._started: float | None = None
         self._covered = 0.0
-        self._align_requests = outlets.control.align_requests
+        self._marked = 0
+        self._align_requests, self._marks = outlets.control.align_requests, outlets.control.marks
+        self._health = HealthWriter(outlets.health, self._combiner)
         self._world = scenario.world_id()
         self._digest = hashlib.blake2b(digest_size=16)
         for feed in scenario.feed:
@@ -180,6 +186,7 @@ class Loop:
     def take(self, batch: FrameArray) -> bool:
         """Decode and navigate a batch of frames; True when it held a sample."""
         driver, got, start = self.driver, False, 0
+        self._health.count(batch)
         while driver.period_s is None and start < len(batch):  # one by one until the board has said what it is
             got = self._between(batch[start : start + 1]) or got
             start += 1
@@ -254,6 +261,7 @@ class Loop:
         self._arrival_ns = arrival = int(arrivals[-1])
         rows["arrival_ns"] = arrival if len(rows) != len(arrivals) else arrivals
         self._publish(rows)
+        self._health.take(raw, self._truth is not None)
         stats = self._outlets.stats
         if self._live:
             stats.count_since(Times.LATENCY, time.time_ns(), arrivals)
@@ -320,14 +328,20 @@ class Loop:
         elif event == REALIGN:
             self._combiner.renew()
             self.navigator.realign(float(self._last()["time"]), "ordered")
+        elif event == MARK:
+            self._marked += 1
+            self.navigator.tell(float(self._last()["time"]), "notice", f"mark {self._marked}")
 
     def ordered_event(self) -> int:
-        """An alignment that another process has ordered since the last look; 0 for none."""
-        requests = self._outlets.control.align_requests
-        if requests == self._align_requests:
-            return 0
-        self._align_requests = requests
-        return REALIGN
+        """An alignment or a mark that another process has ordered since the last look; 0 for none."""
+        control = self._outlets.control
+        if (requests := control.align_requests) != self._align_requests:
+            self._align_requests = requests
+            return REALIGN
+        if control.marks != self._marks:
+            self._marks += 1
+            return MARK
+        return 0
 
     def _last(self) -> Any:
         """The newest solution; all zeros before the first."""
@@ -516,9 +530,9 @@ def take_with_events(loop: Loop, taken: FrameArray) -> bool:
 
 
 def _record(taken: FrameArray, outlets: Outlets, paced: bool) -> None:
-    if not outlets.recording:
-        return
     ring, control = outlets.frames, outlets.control
+    if not control.recording:
+        return
     while not paced and ring.count + len(taken) - control.recorded > ring.capacity and not control.stop:
         time.sleep(0.001)
     ring.push(taken)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -17,6 +17,7 @@ from nav.errors import HilError
 
 if TYPE_CHECKING:
     from hil.bridge import LoopOrder
+    from hil.dashboard import Window
     from hil.scenario import Scenario
     from hil.session import Session
 
@@ -60,6 +61,14 @@ Asserts = Annotated[
     list[str] | None, typer.Option("--assert", help="'error.position_m.max < 0.5'; exit code 1 if not.")
 ]
 Junit = Annotated[Path | None, typer.Option(help="Write the assertions as JUnit XML.")]
+Dashboard = Annotated[
+    str | None,
+    typer.Option(metavar="HOST:PORT", help="Where the window is served; 127.0.0.1:8765 or the next free port."),
+]
+NoDashboard = Annotated[bool, typer.Option("--no-dashboard", help="Serve no window.")]
+Tui = Annotated[
+    bool, typer.Option("--tui", help="Show the run in the terminal; no window unless --dashboard is given.")
+]
 ScenarioName = Annotated[str | None, typer.Argument(help="TOML file or built-in name; left out: the embedded default.")]
 
 
@@ -83,17 +92,15 @@ def run(
     mcap: Mcap = None,
     assertion: Asserts = None,
     junit: Junit = None,
-    no_dashboard: Annotated[
-        bool, typer.Option("--no-dashboard", help="Serve no dashboard (this version has none).")
-    ] = False,
+    dashboard: Dashboard = None,
+    no_dashboard: NoDashboard = False,
+    tui: Tui = False,
     as_json: Json = False,
 ) -> None:
     """Run the bridge: IMU in, navigation, MAVLink out. Without a bus it brings its own simulated head."""
     from hil.bridge import LoopOrder
     from hil.scenario import load
     from hil.session import simulated_head
-
-    del no_dashboard  # accepted, so that command lines stay valid
 
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink, feed=feed)
@@ -124,7 +131,9 @@ def run(
         own_world=not outside,
         realtime=realtime,
     )
-    _run(order, None if outside else simulated_head(order), record, assertion, junit, mcap=mcap, as_json=as_json)
+    screen = _Screen(dashboard, no_dashboard, tui)
+    feeder = None if outside else simulated_head(order)
+    _run(order, feeder, record, assertion, junit, screen=screen, mcap=mcap, as_json=as_json)
 
 
 @app.command()
@@ -176,6 +185,9 @@ def replay(
     ] = None,
     assertion: Asserts = None,
     junit: Junit = None,
+    dashboard: Dashboard = None,
+    no_dashboard: NoDashboard = False,
+    tui: Tui = False,
     as_json: Json = False,
 ) -> None:
     """Send a recording through the same bridge."""
@@ -202,7 +214,8 @@ def replay(
 
         return {"smoothed": smooth_recording(log, order.scenario, smooth)}
 
-    summary = _run(order, feeder, record, assertion, junit, smoothed, mcap=mcap, as_json=as_json)
+    screen = _Screen(dashboard, no_dashboard, tui)
+    summary = _run(order, feeder, record, assertion, junit, smoothed, screen=screen, mcap=mcap, as_json=as_json)
     if plot is not None and order.reference is not None:
         from hil.plot import plot_difference
 
@@ -544,6 +557,24 @@ def version() -> None:
     print(f"dtg-hil {installed('dtg-hil')}")
 
 
+class _Screen(NamedTuple):
+    """How a run is shown besides its status line."""
+
+    address: str | None
+    off: bool
+    tui: bool
+
+    def open(self, *, paced: bool) -> "Window | None":
+        """The window, where one is wanted: by default, in real time, and not beside the terminal's."""
+        from hil.dashboard import open_window
+
+        if self.off and self.address is not None:
+            raise HilError("--dashboard and --no-dashboard exclude each other")
+        if self.off or (self.address is None and (self.tui or not paced)):
+            return None
+        return open_window(self.address, _say)
+
+
 def _run(
     order: "LoopOrder",
     feeder: Any,
@@ -552,6 +583,7 @@ def _run(
     junit: Path | None,
     more: Callable[[], dict[str, Any]] = dict,
     *,
+    screen: _Screen,
     mcap: Path | None = None,
     as_json: bool,
 ) -> dict[str, Any]:
@@ -559,13 +591,16 @@ def _run(
     from hil.assertions import parse, write_junit
     from hil.console import RunView, print_summary
     from hil.session import Session
+    from hil.tui import TerminalView, check_terminal
 
     checks = [parse(text) for text in assertions or []]
     if junit is not None and not checks:
         raise HilError("--junit needs at least one --assert")
+    if screen.tui:
+        check_terminal()
     stop = StopSignal()
-    session = Session(order, feeder=feeder, record=record_to, mcap=mcap)
-    with session, RunView(session) as view:
+    session = Session(order, feeder=feeder, record=record_to, mcap=mcap, window=screen.open(paced=order.paced))
+    with session, TerminalView(session, stop.call) if screen.tui else RunView(session) as view:
         while not (session.ready or stop.wanted):
             view.show_compiling()
             time.sleep(0.1)
@@ -611,6 +646,10 @@ class StopSignal:
         self.wanted = False
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._take)
+
+    def call(self) -> None:
+        """Ask for it."""
+        self.wanted = True
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
         if self.wanted:

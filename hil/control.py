@@ -1,13 +1,14 @@
 """A few numbers that the processes of a run tell each other: one block of shared memory, nobody waits on it.
 
-Orders (stop, go, align) come from the session and the publisher, the loss of samples from the loop, the count of recorded
-frames from the recorder. The readers of the rings give a beat; nobody waits for it.
+Orders (stop, go, align, mark, record, faults) come from the session, the publisher and the dashboard, the loss of samples from
+the loop, the count of recorded frames from the recorder. The readers of the rings give a beat; nobody waits for it.
 """
 
 import multiprocessing as mp
 import os
 import time
 from collections.abc import Callable
+from enum import IntEnum
 from multiprocessing.connection import wait
 from threading import Thread
 from typing import Any
@@ -17,14 +18,28 @@ import numpy as np
 from hil.realtime import step_aside
 from hil.ring import Shared
 
-_STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _LOOP_PID, _LOOP_DONE, _PUBLISHER, _RECORDER, _FIELDS = range(
-    11
+_STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _LOOP_PID, _LOOP_DONE, _PUBLISHER, _RECORDER, *_REST = range(
+    16
 )
+_MARKS, _RECORDING, _RECORD_SINCE, _FAULT, _FAULTS, _FIELDS = _REST
 READERS = {"publisher": _PUBLISHER, "recorder": _RECORDER}
 """Processes that say with a beat that they are at work."""
 
 ORPHAN_S = 10.0
 """Longest time for a process to end on its own when the one that started it is gone."""
+
+
+class Injected(IntEnum):
+    """A fault that the simulated head can be told to have for a second."""
+
+    SILENCE = 1
+    """It sends nothing."""
+    LOSS = 2
+    """One sample of ten does not arrive."""
+    STUCK = 3
+    """g2y goes on giving the same number."""
+    BUILT_IN = 4
+    """Its own test says that gyro 1 has failed."""
 
 
 class Control:
@@ -65,6 +80,43 @@ class Control:
         self._values[_ALIGN_REQUESTS] += 1
 
     @property
+    def marks(self) -> int:
+        """How many marks have been asked for."""
+        return int(self._values[_MARKS])
+
+    def request_mark(self) -> None:
+        """Ask the loop to mark the present moment."""
+        self._values[_MARKS] += 1
+
+    @property
+    def recording(self) -> bool:
+        """The loop hands its frames to the recorder."""
+        return bool(self._values[_RECORDING])
+
+    @recording.setter
+    def recording(self, on: bool) -> None:
+        self._values[_RECORDING] = on
+
+    @property
+    def record_since(self) -> int:
+        """UTC second at which a recording was asked for while running; 0: none is wanted."""
+        return int(self._values[_RECORD_SINCE])
+
+    @record_since.setter
+    def record_since(self, second: int) -> None:
+        self._values[_RECORD_SINCE] = second
+
+    @property
+    def injected(self) -> tuple[int, int]:
+        """(how many faults have been asked for, code of the newest)."""
+        return int(self._values[_FAULTS]), int(self._values[_FAULT])
+
+    def inject(self, fault: Injected) -> None:
+        """Ask the simulated head for a fault."""
+        self._values[_FAULT] = fault
+        self._values[_FAULTS] += 1
+
+    @property
     def lost(self) -> int:
         """Sensor samples lost since the start."""
         return int(self._values[_LOST])
@@ -99,6 +151,10 @@ class Control:
         """Time since a reader's last beat, s; 0 before its first."""
         beat = int(self._values[READERS[reader]])
         return (time.monotonic_ns() - beat) * 1e-9 if beat else 0.0
+
+    def forget_beat(self, reader: str) -> None:
+        """A new reader of this name begins; that of the old one says nothing of it."""
+        self._values[READERS[reader]] = 0
 
     @property
     def recorded(self) -> int:

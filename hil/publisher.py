@@ -28,6 +28,7 @@ from drivers.mavlink.store import Store, state_folder
 from hil.clock import clock_reading
 from hil.control import Control
 from hil.geoid import undulation
+from hil.link_stats import LinkStats
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
 from hil.stats import Stats
@@ -42,6 +43,8 @@ _READ_S = 0.1
 _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
 LOOP_DIED = "the navigation loop died: no solutions any more"
+_TELL_S = 0.2
+"""What went over the links is told so often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,8 @@ class Taps:
         What the loop's clock says is published.
     fixes : Ring, optional
         Of `AIDING`: what receivers have measured.
+    links : LinkStats, optional
+        Told a few times a second what went over the links.
     """
 
     states: Ring
@@ -76,6 +81,7 @@ class Taps:
     early: bool = False
     stats: Stats | None = None
     fixes: Ring | None = None
+    links: LinkStats | None = None
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -105,7 +111,7 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
             signer = _signer(config)
             if signer is not None:
                 stack.callback(signer.close)
-            hub = Hub(station, _links(config), signer)
+            hub = Hub(station, link_options(config), signer)
             stack.callback(hub.close)
         except HilError as error:
             _tell(report, {"failed": str(error)})
@@ -123,6 +129,7 @@ class _Publisher:
     def __init__(self, taps: Taps, station: Station, hub: Hub) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
         self._stats = taps.stats
+        self._links, self._told_s = taps.links, -math.inf
         self._station, self._hub = station, hub
         station.on_attitude = self._attitude_sent
         self._row = np.zeros(1, NAV_STATE)
@@ -187,6 +194,9 @@ class _Publisher:
         if called or now_s - self._read_s > _READ_S:
             self._read(now_s)
         next_s = self._poll(now_s)
+        if self._links is not None and now_s - self._told_s > _TELL_S:
+            self._told_s = now_s
+            self._links.tell(self._hub.tallies())
         if self._hungry() and self._ring.count - self._seen == 1:  # a slow sensor: do not wait for its next solution
             self._read(now_s)
             next_s = self._poll(now_s)
@@ -269,7 +279,14 @@ def _intake(config: MavlinkConfig, taps: Taps) -> Intake | None:
     return Intake(config.aiding_from, config.master, config.aiding_delay_s, relay, **how)
 
 
-def _links(config: MavlinkConfig) -> list[LinkOptions]:
+def link_options(config: MavlinkConfig) -> list[LinkOptions]:
+    """The links of a configuration.
+
+    Raises
+    ------
+    HilError
+        An unknown option of a link, or a wrong value.
+    """
     return [parse_options(one) if isinstance(one, str) else LinkOptions(**one.model_dump()) for one in config.links]
 
 

@@ -14,27 +14,29 @@ from nav.errors import HilError
 
 
 def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: Connection) -> None:
-    """Record until the loop is done and the ring is empty; answers ``{"file", "frames", "lost"}`` or ``{"failed"}``.
+    """Record until the loop is done or hands on no more, and the ring is empty.
 
-    ``{"problem": text}`` goes out at once when the disk takes no more, and when it does again.
+    Answers ``{"file", "frames", "lost"}`` or ``{"failed"}``; ``{"problem": text}`` goes out at once when the disk takes no
+    more, and when it does again.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ring, control, stats = outlets.frames, outlets.control, outlets.stats
     wake = ring.wakes[0]
     batch = frames(4096)
     lost, problem = 0, ""
+    before = stats["recorder_lost"]  # by those that recorded earlier in the run
     try:
         with RecordingWriter(path, header) as writer:
             ring.pull(batch, 0)  # loads the kernel; nothing is sent before we are ready
             answer.send({"ready": True})
             while True:
-                done = stats["phase"] in (Phase.DONE, Phase.FAILED)
+                done = stats["phase"] in (Phase.DONE, Phase.FAILED) or not control.recording
                 control.beat("recorder")
                 number = control.recorded
                 copied, first = ring.pull(batch, number)
                 lost += max(first - number, 0)
                 writer.write(batch[:copied])
-                stats["recorder_lost"] = lost + writer.lost
+                stats["recorder_lost"] = before + lost + writer.lost
                 if writer.problem != problem:
                     problem = writer.problem
                     answer.send({"problem": f"recorder: {_news(writer)}"})

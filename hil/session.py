@@ -1,6 +1,6 @@
 """A run as a whole: starts the processes, watches them, gathers the summary. What `hil run` and the tests stand on.
 
-    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, feeds, this process
+    feeder (simulated head or player) --bus--> loop --rings--> publisher (MAVLink), recorder, feeds, dashboard, this process
                                 receivers --rings--^
 
 Each box is a process of its own. The session notices a process that dies, and stops all when the loop is done.
@@ -23,9 +23,11 @@ from drivers.utc import PulseClock
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.clock import clock_summary
 from hil.control import READERS, run_part
+from hil.dashboard import Sources, Window, recording_name, run_dashboard
 from hil.feed.group import FeedGroup
+from hil.link_stats import LinkStats
 from hil.mcap_recorder import run_mcap
-from hil.publisher import Taps, run_publisher
+from hil.publisher import Taps, link_options, run_publisher
 from hil.receiver import run_receiver
 from hil.recorder import run_recorder
 from hil.ring import Wake
@@ -37,8 +39,8 @@ from nav.state import NAV_STATE, Mode
 
 START_S = 180.0
 """Longest time for the processes to get ready (the first compilation is in it)."""
-PUBLISHER_NICE = 10
-"""How far the publisher steps back behind the loop where processors are few."""
+NICE = {"publisher": 10, "mcap": 10, "dashboard": 5}
+"""How far a part steps back behind the loop where processors are few."""
 RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
@@ -87,6 +89,8 @@ class Session:
         Send MAVLink on the links of the scenario.
     mcap : Path, optional
         File for Foxglove to write; in real time only.
+    window : Window, optional
+        Where the dashboard is served; None: nowhere.
     """
 
     def __init__(
@@ -97,10 +101,15 @@ class Session:
         record: Path | None = None,
         publish: bool = True,
         mcap: Path | None = None,
+        window: Window | None = None,
     ) -> None:
         if mcap is not None and not order.paced:
             raise HilError("--mcap needs real time: record the run with --record FILE, then `hil export FILE out.mcap`")
         self.order = order
+        self.links = LinkStats(link_options(order.scenario.mavlink) if publish else ())
+        self.recordings: list[dict[str, Any]] = []
+        """What became of the recordings that were asked for while running."""
+        self._window = window
         self.feeds = FeedGroup(order.scenario, paced=order.paced)
         self._receivers = {f"receiver {k}": one for k, one in enumerate(order.scenario.receiver if order.live else ())}
         readers = 1 + len(self.feeds.names)
@@ -139,40 +148,50 @@ class Session:
     ) -> None:
         self._end()
 
-    def _start(self) -> None:
-        scenario, outlets = self.order.scenario, self.outlets
+    def _launch(self, name: str, target: Callable[..., None], *args: Any) -> None:
         context = mp.get_context("forkserver")
+        ours, theirs = context.Pipe()
+        aside = self.order.realtime and name != "loop"
+        process = context.Process(
+            target=run_part,
+            args=(self.outlets.control, NICE.get(name, 0), aside, target, *args, theirs),
+            name=f"hil-{name}",
+            daemon=True,
+        )
+        process.start()
+        theirs.close()
+        self._parts[name] = _Part(name, process, ours)
+
+    def _launch_recorder(self, path: Path) -> None:
+        header = {"scenario": self.order.scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
+        self.outlets.control.forget_beat("recorder")
+        self._launch("recorder", run_recorder, path, header, self.outlets)
+
+    def _start(self) -> None:
+        scenario, outlets, launch = self.order.scenario, self.outlets, self._launch
         preload = ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
-        context.set_forkserver_preload([*preload, "hil.receiver"] if self._receivers else preload)
-
-        def launch(name: str, target: Callable[..., None], *args: Any) -> None:
-            ours, theirs = context.Pipe()
-            nice = PUBLISHER_NICE if name in {"publisher", "mcap"} else 0
-            aside = self.order.realtime and name != "loop"
-            process = context.Process(
-                target=run_part,
-                args=(outlets.control, nice, aside, target, *args, theirs),
-                name=f"hil-{name}",
-                daemon=True,
-            )
-            process.start()
-            theirs.close()
-            self._parts[name] = _Part(name, process, ours)
-
+        mp.get_context("forkserver").set_forkserver_preload([*preload, "hil.receiver"] if self._receivers else preload)
         if self._record is not None:
-            header = {"scenario": scenario.model_dump(mode="json"), "created_ns": time.time_ns()}
-            launch("recorder", run_recorder, self._record, header, outlets)
+            self._launch_recorder(self._record)
         if self._mcap is not None:
             launch("mcap", run_mcap, self._mcap, outlets)
         launch("loop", run_loop, self.order, outlets)
         if self._feeder is not None:
             target, args = self._feeder
             launch("feeder", target, *args, outlets.control, outlets.stats)
+        if self._window is not None:
+            simulated = self._feeder is not None and self._feeder[0] is run_head
+            launch(
+                "dashboard",
+                run_dashboard,
+                self._window,
+                Sources(self.order, outlets, self.links, simulated=simulated, recorded=self._record is not None),
+            )
+            self._window.socket.close()  # the port lives as long as its process
         if self._publish and scenario.mavlink.links:
             network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
-            taps = Taps(
-                outlets.states, 0, outlets.events, outlets.control, network, early, outlets.stats, outlets.fixes
-            )
+            shared = outlets.stats, outlets.fixes, self.links
+            taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
         self.feeds.launch(launch, outlets.states, 1)
         for k, (name, config) in enumerate(self._receivers.items()):
@@ -194,14 +213,15 @@ class Session:
             A part of the run failed, or did not get ready in time.
         """
         self._watch()
+        if self.outlets.control.go:
+            return True
         heralds = [part for name, part in self._parts.items() if name in {"recorder", "mcap", *self._receivers}]
         if self.outlets.stats["phase"] == Phase.STARTING or any("ready" not in part.answers for part in heralds):
             return False
         if len(self.feed_places()) < len(self.feeds.names):
             return False
-        if not self.outlets.control.go:
-            self._began = time.monotonic()
-            self.outlets.control.order_go()
+        self._began = time.monotonic()
+        self.outlets.control.order_go()
         return True
 
     @property
@@ -225,7 +245,27 @@ class Session:
                 self._feeder_ended, self._drained = time.monotonic(), frames
             if time.monotonic() - self._feeder_ended > DRAIN_S:
                 self.stop()
+        if self._record is None:
+            self._record_as_wanted()
         return self.outlets.stats["phase"] in (Phase.READY, Phase.RUNNING) and not self.outlets.control.stop
+
+    def _record_as_wanted(self) -> None:
+        """Begin or end a recording that was asked for while running."""
+        control, recorder = self.outlets.control, self._parts.get("recorder")
+        if recorder is None:
+            if control.record_since:
+                control.recorded = self.outlets.frames.count
+                control.recording = True
+                self._launch_recorder(Path(recording_name(control.record_since)))
+            return
+        if not control.record_since:
+            control.recording = False
+        if not recorder.process.is_alive():
+            self._watch()
+            control.recording, control.record_since = False, 0
+            self._stopped.discard("recorder")
+            self.recordings.append(self._answers("recorder"))
+            del self._parts["recorder"]
 
     def wait_ready(self, on_wait: Callable[[], None] = lambda: None) -> None:
         """Block until the loop listens; `on_wait` is called ten times a second."""
@@ -333,7 +373,16 @@ class Session:
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
         deadline = time.monotonic() + STOP_S
-        for name in ("loop", "feeder", "recorder", "mcap", "publisher", *self._receivers, *self.feeds.names):
+        for name in (
+            "loop",
+            "feeder",
+            "recorder",
+            "mcap",
+            "publisher",
+            *self._receivers,
+            *self.feeds.names,
+            "dashboard",
+        ):
             part = self._parts.get(name)
             if part is None:
                 continue
@@ -378,13 +427,15 @@ class Session:
             result["clock"] = clock
             if (utc := self._pulses.summary()) is not None:
                 clock["utc"] = utc
-        for name in ("loop", "feeder", "publisher", "recorder", "mcap"):
+        for name in ("loop", "feeder", "publisher", "recorder", "mcap", "dashboard"):
             if name in self._parts:
                 answers = self._answers(name)
                 if name == "loop":
                     result.update(answers)
                 else:
                     result[name] = answers
+        if self.recordings:
+            result["recordings"] = self.recordings
         if feeds := self._feed_summaries():
             result["feeds"] = feeds
         if "wire" in result.get("feeder", {}):

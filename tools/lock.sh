@@ -1,6 +1,6 @@
 #!/bin/bash
 # Write constraints.txt from what .venv holds now. After a look at the outcome of `make test`:
-#   make dev && .venv/bin/pip install -U --upgrade-strategy eager -e '.[logs,plot,magnetic,test,dev]' && tools/lock.sh
+#   make dev && .venv/bin/pip install -U --upgrade-strategy eager -e '.[dashboard,logs,plot,magnetic,test,dev]' && tools/lock.sh
 set -eu
 cd "$(dirname "$0")/.."
 pins=$(.venv/bin/pip freeze --exclude-editable | grep -v ' @ ') # a package from a local file has no version to pin

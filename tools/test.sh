@@ -37,6 +37,9 @@ run_here() {
   return $side_by_side
 }
 
+if ! command -v chromium >/dev/null && can_install; then
+  make --no-print-directory browser || echo "test: no browser: the tests of the window are skipped" >&2
+fi
 have_vcan0 || make_vcan0
 with_vcan0=$?
 run_here "$@"

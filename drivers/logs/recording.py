@@ -34,6 +34,8 @@ SILENCE = 1
 """Event, ``data[0]``: the sensor fell silent here."""
 REALIGN = 2
 """Event: a new alignment was ordered here."""
+MARK = 3
+"""Event: the user marked this moment."""
 _HEAD = struct.Struct("<II")
 _BLOCK_HEAD = struct.Struct("<4sII")
 

@@ -1,8 +1,9 @@
 """The simulated sensor head: the scenario's motion through its instruments onto the bus, in a process of its own. What else the
 simulated world measures goes out between the samples.
 
-The frames depend on the scenario alone: the same scenario gives the same bytes at any speed. With a `driver` other than that of
-the DTG head they are those of the board of that driver: the same increments, as that board rounds them.
+The frames depend on the scenario alone, and on faults injected while it runs: the same scenario gives the same bytes at any
+speed. With a `driver` other than that of the DTG head they are those of the board of that driver: the same increments, as that
+board rounds them.
 """
 
 import math
@@ -26,6 +27,7 @@ from hil.warmup import warm_head
 from hil.wire_config import check_board
 from hil.world.aiding import SimulatedAiding
 from hil.world.faults import Wire
+from hil.world.injection import Injection
 from hil.world.instruments import instruments
 from nav.errors import HilError
 from nav.increments import FloatArray, ImuIncrements
@@ -58,6 +60,8 @@ class SimulatedHead:
         )
         check_board(scenario.driver, scenario.wire)
         self.wire = Wire(scenario, self.period_us, self.frames_per_sample) if scenario.wire else None
+        self.injection: Injection | None = None
+        """Faults that it is told to have while it runs."""
         self._aiding, self._aiding_encoder = SimulatedAiding(scenario), AidingEncoder()
         self._slow_every = max(1, round(1.0 / self.step))
         self._chunk = max(1, min(self._slow_every, round(CHUNK_S / self.step)))
@@ -79,6 +83,8 @@ class SimulatedHead:
 
     def _samples(self, first: int, count: int) -> FrameArray:
         sensed = self._instruments.sense(first, count)
+        if self.injection is not None:
+            self.injection.sensed(first, sensed)
         counter = np.arange(first, first + count)
         ends = (counter + 1) * self.period_us
         said, shown = counter, ends
@@ -124,7 +130,7 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
         for due_s, piece in faulty(head, head.wire, samples):
             if cancelled() or (paced and not pacer.wait(due_s, cancelled)):
                 break
-            port.send(piece)
+            port.send(piece if head.injection is None else head.injection.sent(head.wire.samples, piece))
         return head.wire.samples
     k = head.frames_per_sample
     sent = 0
@@ -141,7 +147,7 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
         for i, piece in enumerate(np.split(batch, starts[1:])):
             if not pacer.wait((first + i + 1) * head.step, cancelled):
                 return sent
-            port.send(piece)
+            port.send(piece if head.injection is None else head.injection.sent(first + i, piece))
             sent += 1
     return sent
 
@@ -162,6 +168,7 @@ def run_head(scenario: Scenario, paced: bool, control: Control, stats: Stats, an
     try:
         warm_head(scenario, lambda done: stats.__setitem__("warm_head", done))
         head = SimulatedHead(scenario)
+        head.injection = Injection(control, head.step)
         while not (control.go or control.stop):
             time.sleep(0.005)
         answer.send(feed(head, scenario, paced=paced, cancelled=lambda: control.stop))

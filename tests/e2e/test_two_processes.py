@@ -88,7 +88,7 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
     programs: list[Program] = []
 
     def call(command: str, *arguments: object) -> Program:
-        quiet = ("--mavlink", "none") if command == "run" else ()
+        quiet = ("--mavlink", "none", "--no-dashboard") if command == "run" else ()
         programs.append(Program(command, tmp_path / "bench.toml", *quiet, *arguments))
         return programs[-1]
 
