@@ -85,7 +85,10 @@ def _text(path: Path) -> Iterator[tuple[str, list[Any]]]:
 
 def _archive(path: Path) -> Iterator[tuple[str, list[Any]]]:
     with np.load(path, allow_pickle=False) as archive:
-        columns = [archive[name].tolist() for name in AID_HEADER]
+        found = [archive[name] for name in AID_HEADER]
+    if not all(isinstance(column, np.ndarray) and column.ndim == 1 for column in found):
+        raise ValueError("a column is no array of one dimension")  # numpy hands on the bytes of a member that is none
+    columns = [column.tolist() for column in found]
     yield from _numbered(columns)
 
 

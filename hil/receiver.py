@@ -108,9 +108,9 @@ class Relay:
             if fix.refused:
                 continue
             time_s = device_s(self._stats, host_ns)
-            if not (time_s >= 0.0 and self._clock.settled(fix)):
-                why = "clock settles" if time_s >= 0.0 else "no inertial sample yet"
-                self.receiver.refused[why] += 1
+            settled = self._clock.settled(fix)
+            if not (settled and time_s >= 0.0):
+                self.receiver.refused["no inertial sample yet" if settled else "clock settles"] += 1
                 continue
             fix.rows["time"], fix.rows["source"] = time_s, self._source
             self._send(fix.rows)
