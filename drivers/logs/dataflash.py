@@ -128,10 +128,11 @@ def _read(path: Path) -> tuple[dict[str, _Columns], dict[str, float]]:
     found: dict[str, dict[str, list[float]]] = {}
     parameters: dict[str, float] = {}
     said = io.StringIO()  # the reader prints what it does not understand, also to standard output
+    reader = Reader.__new__(Reader)
     try:
         path.open("rb").close()
         with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
-            reader = Reader(str(path))
+            reader.__init__(str(path))  # type: ignore[misc]
             while (message := reader.recv_match(type=wanted)) is not None:
                 fields = message.to_dict()
                 name = fields.pop("mavpackettype")
@@ -146,6 +147,8 @@ def _read(path: Path) -> tuple[dict[str, _Columns], dict[str, float]]:
     except Exception as error:  # the reader raises whatever the bytes provoke
         if not found:
             raise HilError(f"log {path}: not a readable DataFlash log: {error}") from error
+    finally:
+        reader.__dict__.clear()  # it holds the file and messages that hold it
     if not found:
         raise HilError(f"log {path}: not a readable DataFlash log: it holds no messages of sensors")
     return {
