@@ -17,6 +17,7 @@ import io
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -45,6 +46,8 @@ _SENSORS = {
     "accuracy": ("GPA", "GPA2", "UBX3"),
 }
 """Messages of each sensor; the place is the number of a sensor whose message does not say it."""
+_HEAD = 3
+"""Bytes that every message begins with."""
 _LONGEST_US = 1e15
 _DELAY_MS = (("EKF_POS_DELAY", "EK2_GPS_DELAY", "GPS_DELAY_MS", "GPS1_DELAY_MS"), 200.0)
 _MAG_NOISE = (("EK3_MAG_M_NSE", "EK2_MAG_M_NSE", "EKF_MAG_NOISE"), 0.05)  # Gs
@@ -117,12 +120,22 @@ def _log(messages: Mapping[str, _Columns], parameters: Mapping[str, float], undu
     )
 
 
+class _Formats(dict[int, Any]):
+    """Formats of messages by number, but for damaged ones: one shorter than its head holds the reader in its place for ever."""
+
+    def __setitem__(self, number: int, form: Any) -> None:
+        if form.len >= _HEAD:
+            super().__setitem__(number, form)
+
+
 def _read(path: Path) -> tuple[dict[str, _Columns], dict[str, float]]:
     """Columns of each message that is wanted, by its name, and the parameters."""
     from pymavlink.DFReader import DFReader_binary
 
     class Reader(DFReader_binary):  # type: ignore[misc]
-        init_arrays_fast = DFReader_binary.init_arrays  # the fast one is in C, and prints past our ears
+        def init_arrays_fast(self, progress_callback: Any = None) -> None:  # the one in C prints past our ears
+            self.formats: dict[int, Any] = _Formats(self.formats)
+            self.init_arrays(progress_callback)
 
     wanted = {"IMU", "PARM", *_ATTITUDES, *(name for names in _SENSORS.values() for name in names)}
     found: dict[str, dict[str, list[float]]] = {}

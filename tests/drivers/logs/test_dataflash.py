@@ -204,7 +204,14 @@ def test_a_board_whose_clock_is_wrong_is_put_right_by_its_receiver(clock, tmp_pa
     np.testing.assert_allclose(arrivals * 1e-6 - fixes["time"], 0.12 * scale, atol=3e-6)
 
 
-@pytest.mark.parametrize("content", [b"", b"\xa3\x95\x80", b"not a log at all\n" * 100, bytes(range(256)) * 40])
+NO_LENGTH = (
+    b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", 0x81, 0, b"IMU", b"QB", b"TimeUS,I") + b"\xa3\x95\x81" + bytes(200)
+)
+"""A message of no bytes: a reader that goes on by its length stays where it is."""
+FOREIGN = b"", b"\xa3\x95\x80", b"not a log at all\n" * 100, bytes(range(256)) * 40, NO_LENGTH
+
+
+@pytest.mark.parametrize("content", FOREIGN)
 def test_foreign_files(tmp_path, content):
     with pytest.raises(HilError, match=r"made\.bin"):
         read(content, tmp_path)
