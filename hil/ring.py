@@ -6,6 +6,7 @@ many. Memory and wake-ups are anonymous file descriptors, so that nothing is lef
 
 import mmap
 import os
+import weakref
 from multiprocessing import reduction
 from typing import Any
 
@@ -80,6 +81,7 @@ class Shared:
         if fd is None:
             fd = os.memfd_create("dtg-hil")
             os.ftruncate(fd, size)
+        weakref.finalize(self, os.close, fd)
         self.fd = fd
         self.size = size
         self.memory = mmap.mmap(fd, size)
@@ -97,6 +99,7 @@ class Wake:
 
     def __init__(self, fd: int | None = None) -> None:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if fd is None else fd
+        weakref.finalize(self, os.close, self.fd)
 
     def fileno(self) -> int:
         """The descriptor to wait on for reading."""

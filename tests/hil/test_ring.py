@@ -1,6 +1,8 @@
 """The shared-memory ring between real processes: nothing torn, nothing lost in silence, nobody waits."""
 
+import gc
 import multiprocessing
+import os
 import select
 import time
 
@@ -121,3 +123,13 @@ def test_as_a_list_that_forgets(steps, capacity):
         assert copied == min(n, written - first)
         assert batch["number"][:copied].tolist() == list(range(first, first + copied))
         number = first + copied
+
+
+def test_what_nobody_holds_any_more_gives_its_descriptors_back():
+    """A test suite makes hundreds of bridges in one process."""
+    gc.collect()
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(50):
+        Ring(ROW, 16, 2)
+    gc.collect()
+    assert len(os.listdir("/proc/self/fd")) <= before
