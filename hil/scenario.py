@@ -492,6 +492,7 @@ class Scenario(_Model):
         """
         kept = {"motion", "head", "seed"}
         world = self.model_dump(mode="json", include=kept, exclude={"head": {"calibration"}}, exclude_defaults=True)
+        world = {key: value for key, value in world.items() if value}
         return zlib.crc32(json.dumps(world, sort_keys=True).encode()) or 1
 
 

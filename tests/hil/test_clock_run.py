@@ -177,14 +177,15 @@ def test_a_recording_tells_a_step_of_the_host(tmp_path: Path, step: float) -> No
 
 
 def test_a_recording_tells_a_step_of_the_device(tmp_path: Path) -> None:
-    """The samples are counted: time and count of the device part."""
+    """Its count goes with its time: a driver mends a clock that jumps alone."""
     numbers, encoder = (
         np.arange(4000),
         HeadEncoder("fd", 10_000, serial=1, world_id=0, hardware=SIMULATED, rotor_hz=0.0),
     )
-    ends = (numbers + 1) * 10_000 + np.where(numbers >= 2500, 300_000, 0)
+    jump = np.where(numbers >= 2500, 30, 0)
+    ends = (numbers + 1 + jump) * 10_000
     slow, zeros = encoder.slow(), np.zeros((4000, 4))
-    samples = encoder.samples(numbers, ends, zeros, zeros[:, :3], np.zeros(4000, np.int64), zeros)
+    samples = encoder.samples(numbers + jump, ends, zeros, zeros[:, :3], np.zeros(4000, np.int64), zeros)
     batch = np.concatenate([slow, samples])
     late = np.random.default_rng(2).exponential(150e-6, len(samples))
     batch["time_ns"] = START
