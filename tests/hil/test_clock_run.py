@@ -176,22 +176,23 @@ def test_a_recording_tells_a_step_of_the_host(tmp_path: Path, step: float) -> No
     assert [(s["clock"], s["step_s"]) for s in said["steps"]] == [("host", pytest.approx(-step, abs=2e-3))]
 
 
-def test_a_recording_tells_a_step_of_the_device(tmp_path: Path) -> None:
-    """Its count goes with its time: a driver mends a clock that jumps alone."""
+def test_a_device_whose_clock_jumps_alone_is_mended_by_its_driver(tmp_path: Path) -> None:
+    """Its counter goes on, and time with it: the driver counts the jump, and none is left for the fit."""
     numbers, encoder = (
         np.arange(4000),
         HeadEncoder("fd", 10_000, serial=1, world_id=0, hardware=SIMULATED, rotor_hz=0.0),
     )
-    jump = np.where(numbers >= 2500, 30, 0)
-    ends = (numbers + 1 + jump) * 10_000
+    ends = (numbers + 1) * 10_000 + np.where(numbers >= 2500, 300_000, 0)
     slow, zeros = encoder.slow(), np.zeros((4000, 4))
-    samples = encoder.samples(numbers + jump, ends, zeros, zeros[:, :3], np.zeros(4000, np.int64), zeros)
+    samples = encoder.samples(numbers, ends, zeros, zeros[:, :3], np.zeros(4000, np.int64), zeros)
     batch = np.concatenate([slow, samples])
     late = np.random.default_rng(2).exponential(150e-6, len(samples))
     batch["time_ns"] = START
     batch["time_ns"][len(slow) :] += np.rint((numbers * 0.01 + late) * 1e9).astype(np.int64)
-    said = json.loads(hil("clock", recorded(tmp_path / "d.dhil", batch), "--json")[0])
-    assert [(s["clock"], s["step_s"]) for s in said["steps"]] == [("device", pytest.approx(0.3, abs=2e-3))]
+    path = recorded(tmp_path / "d.dhil", batch)
+    assert json.loads(hil("clock", path, "--json")[0])["steps"] == []
+    counters = json.loads(hil("decode", "dtg-head", path)[1].splitlines()[-1])
+    assert (counters["clock_steps"], counters["lost"]) == (1, 0)
 
 
 def test_a_plot_is_drawn(tmp_path: Path) -> None:
