@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from nav.cut import Cut
 from nav.increments import FloatArray, ImuIncrements, IntArray
 from nav.kernel import kernel
 from nav.state import NAV_STATE
@@ -91,18 +92,12 @@ class Solutions:
             before = self._rows[0].copy()
             self._room(2 * n + 1)
             self._rows[0] = before
-        rows = self._views.get(n)
-        if rows is None:
-            rows = self._views[n] = self._rows[1 : n + 1]
-        return rows
+        return self._views[n]
 
     def answers(self, n: int) -> Answers:
         """Room for the place, velocity and attitude of `n` samples; valid until there is more to fill."""
         self.room(n)
-        answers = self._answers.get(n)
-        if answers is None:
-            answers = self._answers[n] = Answers(*(array[:n] for array in self._scratch))
-        return answers
+        return self._answers[n]
 
     def fill(
         self,
@@ -142,8 +137,8 @@ class Solutions:
 
     def _room(self, n: int) -> None:
         self._rows = np.zeros(n, NAV_STATE)
-        self._scratch = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4))
-        self._views: dict[int, StateArray] = {}
-        self._answers: dict[int, Answers] = {}
+        rows, scratch = self._rows, (np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)))
+        self._views = Cut[StateArray](lambda m: rows[1 : m + 1])
+        self._answers = Cut(lambda m: Answers(*(array[:m] for array in scratch)))
         self._state = tuple(self._rows[name] for name in _STATE)
         self._sample = tuple(self._rows[name] for name in _SAMPLE)

@@ -17,6 +17,7 @@ from nav import attitude as attitudes
 from nav import step as kernels
 from nav.body_integrals import MAX_WINDOW, integrate_blocks, integrate_body
 from nav.checks import check_room, read_array
+from nav.cut import Cut
 from nav.earth import RATE, curvature_radii
 from nav.errors import HilError
 from nav.gravitation import field_code
@@ -106,7 +107,8 @@ class Strapdown:
         self.start(0.0, 0.0, 0.0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
     def _look(self) -> None:
-        """Look into the core."""
+        """Look into the core, and into the room for the integrals."""
+        self._views = Cut(self._cut)
         self._memory, self._state = self._core[kernels.MEMORY_PART], self._core[kernels.STATE_PART]
         self.solution = self._core[kernels.SOLUTION_PART][:10]
         self._azimuth = self._core[kernels.SOLUTION_PART][10:]
@@ -114,13 +116,12 @@ class Strapdown:
 
     def __getstate__(self) -> dict[str, Any]:
         """What copies and pickles are made of: all but the ways into the core."""
-        ways = "_memory", "_state", "solution", "_azimuth", "push", "_seen"
+        ways = "_memory", "_state", "solution", "_azimuth", "push", "_views"
         return {name: value for name, value in self.__dict__.items() if name not in ways}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on with a core of one's own."""
         self.__dict__.update(deepcopy(state))
-        self._seen = dict[int, _Body]()
         self._look()
 
     @property
@@ -308,7 +309,7 @@ class Strapdown:
         self, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, gyro_bias: FloatArray, out: Answers
     ) -> int:
         n = len(step)
-        code, (dq, dv, ds, azimuths) = int(self._core[kernels.CODE]), self._views(n)
+        code, (dq, dv, ds, azimuths) = int(self._core[kernels.CODE]), self._views[n]
         body = dq, dv, ds
         if self._stream is None and (not self._blocks or (step > 0.0).all()):
             how = code, self._field, self._window, self._blocks
@@ -351,7 +352,7 @@ class Strapdown:
         rows = np.array(lead)
         data = [np.ascontiguousarray(part) for part in (rows[:, 0], rows[:, 1:4], rows[:, 4:7])]
         again = Answers(np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)))
-        dq, dv, ds, azimuths = self._views(n)
+        dq, dv, ds, azimuths = self._views[n]
         self._state[:] = self._origin
         how = MECHANIZATIONS.index(self.mechanization), self._field, self._window, True
         work = self._memory, self._state, np.zeros(3)
@@ -376,15 +377,12 @@ class Strapdown:
 
     def _room(self, n: int) -> None:
         self._body = np.zeros((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
-        self._seen = dict[int, _Body]()
+        self._views.clear()
 
-    def _views(self, n: int) -> _Body:
+    def _cut(self, n: int) -> _Body:
         """Room for the body integrals (rotation, velocity, position) and azimuths of `n` samples."""
-        views = self._seen.get(n)
-        if views is None:
-            dq, dv, ds, azimuths = self._body
-            views = self._seen[n] = dq[:n], dv[:n], ds[:n], azimuths[:n]
-        return views
+        dq, dv, ds, azimuths = self._body
+        return dq[:n], dv[:n], ds[:n], azimuths[:n]
 
     def _turn(self, stream: attitudes.AttitudeStream, step: FloatArray, dtheta: FloatArray) -> None:
         """Replace the rotation by that of the attitude method."""

@@ -8,7 +8,7 @@ jumps and the counter goes on, the clock was set, and time goes on with the coun
 period, not the gap.
 """
 
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 
 import numpy as np
@@ -20,6 +20,7 @@ from drivers.can.codec import Database, MessageCodec, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray, as_bytes
 from drivers.can.integrity import Protection, protection
 from drivers.can.samples import signed
+from nav.cut import Cut
 from nav.errors import HilError
 from nav.increments import FloatArray, HeadIncrements, IntArray, Validity
 from nav.kernel import inline_kernel, kernel
@@ -280,7 +281,7 @@ class DtgHead:
         self._values = np.zeros((n, _COLUMNS))
         self._good = np.zeros(n, np.bool_)
         self._rows, self._times = np.zeros(n, np.int64), np.zeros(n, np.int64)
-        self._views: dict[int, HeadIncrements] = {}
+        self._views = Cut(partial(self._batch.rows, 0))
         self._said = np.zeros((n, _SAID))
 
     def identity(self) -> dict[str, object]:
@@ -323,9 +324,7 @@ class DtgHead:
         count = _track(values, self._good[:n], said, self._state, self._outcome, *samples, self._rows)
         sensed = batch.dtheta, batch.rotor, batch.dvel, batch.validity, batch.status, batch.spin, batch.temperature
         _fill(count, self._rows, values, said, times, *sensed, self._times)
-        result = self._views.get(count)
-        if result is None:
-            result = self._views[count] = batch.rows(0, count)
+        result = self._views[count]
         self._arrivals = self._times[:count]
         counters, outcome = self.counters, self._outcome
         counters.samples, counters.lost, counters.late = (

@@ -12,6 +12,7 @@ from dataclasses import astuple, dataclass, field
 
 import numpy as np
 
+from nav.cut import Cut
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray, Validity
 from nav.instruments import redundancy
 from nav.instruments.calibration import Calibration, Calibrator, outside
@@ -158,7 +159,7 @@ class HeadCombiner:
         self._notes: list[Note] = []
         self.faults = np.zeros(7, np.int64)
         self.residual = np.zeros(0)
-        self._views: dict[int, _Views] = {}
+        self._views = Cut(self._cut)
         self._room(256)
         self._speeds = np.array([rotor.spin / (2.0 * math.pi) for rotor in self._rotors or ()])
         self.renew()
@@ -188,7 +189,7 @@ class HeadCombiner:
             An increment is not finite.
         """
         n = len(head)
-        gyro, imu, said, self.residual = self._views.get(n) or self._view(n)
+        gyro, imu, said, self.residual = self._views[n]
         dtheta, dvel, validity = imu.dtheta, imu.dvel, imu.validity
         if self._lag is None:
             gyro[:] = head.dtheta
@@ -284,12 +285,11 @@ class HeadCombiner:
             return "the others carry on, none is left to spare"
         return "no other axis measures its rate: attitude is not to be trusted"
 
-    def _view(self, n: int) -> _Views:
-        """Room for `n` samples, made once."""
+    def _cut(self, n: int) -> _Views:
+        """Room for `n` samples."""
         if n > len(self._imu):
             self._room(2 * n)
-        self._views[n] = self._gyro[:n], self._imu.rows(0, n), self._said[:n], self._residuals[:n]
-        return self._views[n]
+        return self._gyro[:n], self._imu.rows(0, n), self._said[:n], self._residuals[:n]
 
     def _room(self, n: int) -> None:
         self._views.clear()

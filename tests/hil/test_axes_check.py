@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from beside import beside
 from commands import hil
 from postures import RATE_HZ, SEQUENCE, increments, through
 from scipy.spatial.transform import Rotation
@@ -135,9 +136,8 @@ def test_a_user_is_led_through_the_sequence(monkeypatch: pytest.MonkeyPatch) -> 
     """A board that does as it is told, ten times as fast as a hand."""
     url, turn = f"unix:axes-{time.monotonic_ns():x}", matrix(("-y", "x", "z"))
     batch = by_board(through(SEQUENCE), turn, turn)
-    ended = threading.Event()
 
-    def feed() -> None:
+    def feed(ended: threading.Event) -> None:
         port = open_port(url, listen=False)
         try:
             while port.listeners == 0 and not ended.wait(0.01):  # type: ignore[attr-defined]
@@ -149,13 +149,8 @@ def test_a_user_is_led_through_the_sequence(monkeypatch: pytest.MonkeyPatch) -> 
         finally:
             port.close()
 
-    thread = threading.Thread(target=feed)
-    thread.start()
-    try:
+    with beside(feed):
         out, err = hil("check-axes", "--bus", url, "--imu", "sbg", "--json")
-    finally:
-        ended.set()
-        thread.join()
     assert json.loads(out)["head_axes"] == ["-y", "x", "z"]
     told = [line for line in err.splitlines() if " of 6: " in line]
     assert [line[:6] for line in told] == [f"{k} of 6" for k in range(1, 7)]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from beside import beside
 from commands import hil
 from serial.tools.list_ports_common import ListPortInfo
 
@@ -59,13 +60,13 @@ def test_each_extra_names_its_mend() -> None:
 @pytest.mark.socketcan
 def test_a_can_interface_has_a_state_and_a_board() -> None:
     assert named("vcan0") == [{"what": "vcan0", "verdict": "ok", "found": "up, mtu 72", "mend": ""}]
-    imu, ended = ImuIncrements.empty(2000), threading.Event()
+    imu = ImuIncrements.empty(2000)
     imu.step[:], imu.time[:], imu.sequence[:] = 0.01, 0.01 * np.arange(1, 2001), np.arange(2000)
     imu.dvel[:, 2] = -0.0981
     emulator = make_emulator("xsens-can", 10_000)
     batch = emulator.samples(imu)
 
-    def feed() -> None:
+    def feed(ended: threading.Event) -> None:
         port = open_port("socketcan:vcan0", listen=False)
         for start in range(0, len(batch), 40):
             port.send(batch[start : start + 40].copy())
@@ -73,11 +74,6 @@ def test_a_can_interface_has_a_state_and_a_board() -> None:
                 break
         port.close()
 
-    thread = threading.Thread(target=feed)
-    thread.start()
-    try:
+    with beside(feed):
         found = named("vcan0", "--probe")
-    finally:
-        ended.set()
-        thread.join()
     assert [one["found"] for one in found] == ["up, mtu 72", "hil run --imu xsens-can --bus socketcan:vcan0"]

@@ -18,6 +18,7 @@ import can
 import cantools
 import numpy as np
 import pytest
+from beside import beside
 from commands import hil
 from hypothesis import given
 from hypothesis import strategies as st
@@ -261,9 +262,8 @@ def test_a_bridge_does_not_notice(hil_bridge: StartBridge) -> None:
 @contextmanager
 def sending(url: str, batch: FrameArray) -> Iterator[None]:
     """A board on a bus, ten samples at a time, as long as it is wanted."""
-    ended = threading.Event()
 
-    def feed() -> None:
+    def feed(ended: threading.Event) -> None:
         port = open_port(url, listen=False)
         try:
             for start in range(0, len(batch), 20):
@@ -273,13 +273,8 @@ def sending(url: str, batch: FrameArray) -> Iterator[None]:
         finally:
             port.close()
 
-    thread = threading.Thread(target=feed)
-    thread.start()
-    try:
+    with beside(feed):
         yield
-    finally:
-        ended.set()
-        thread.join()
 
 
 def test_lines_where_there_is_no_terminal() -> None:
@@ -326,23 +321,18 @@ def port_file(tmp_path: Path) -> Path:
 @contextmanager
 def plugged(name: str, path: Path, baud: int) -> Iterator[None]:
     """A board on a port that sends a hundred packets a second."""
-    emulator, ended = BOARDS[name][1](), threading.Event()
+    emulator = BOARDS[name][1]()
     with Plugged(None, path, only_baud=baud) as board:
 
-        def feed() -> None:
+        def feed(ended: threading.Event) -> None:
             for k in range(5000):
                 for packet in emulator.packets(moving(1, start_s=5.0 + 0.01 * k)):
                     board.send(packet)
                 if ended.wait(0.01):
                     return
 
-        thread = threading.Thread(target=feed)
-        thread.start()
-        try:
+        with beside(feed):
             yield
-        finally:
-            ended.set()
-            thread.join()
 
 
 @pytest.mark.parametrize("name", BOARDS)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from beside import beside
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from pty_board import Plugged, cut
@@ -363,22 +364,17 @@ def test_two_receivers_at_once_on_two_ports(tmp_path: Path) -> None:
 @pytest.mark.parametrize("baud", [9600, 115200])
 def test_a_wrong_rate_is_found(port_file: Path, baud: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probe, "RATES", (38400, 9600, 115200))
-    emulator, ended = NmeaEmulator(MIDNIGHT, geoid), threading.Event()
+    emulator = NmeaEmulator(MIDNIGHT, geoid)
     with Plugged(emulator, port_file, only_baud=baud) as plug:
 
-        def speak() -> None:
+        def speak(ended: threading.Event) -> None:
             while not ended.wait(0.05):
                 plug.send(emulator.packets(sky(1))[0])
 
-        thread = threading.Thread(target=speak)
-        thread.start()
-        try:
+        with beside(speak):
             assert probe.check_receiver(f"serial:{port_file}:{baud}") == ""
             with pytest.raises(HilError, match=rf"gnss at {baud} baud: use --gnss serial:{port_file}:{baud}"):
                 probe.check_receiver(f"serial:{port_file}:57600", 0.3)
-        finally:
-            ended.set()
-            thread.join()
 
 
 def test_setting_up_and_refusals(port_file: Path) -> None:

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from beside import beside
 from pty_board import BOARDS, Plugged, moving
 
 from drivers import driver_names
@@ -22,22 +23,16 @@ def sending(name: str, path: Path, baud: int) -> Iterator[None]:
     """A board that sends without end at a rate of its own."""
     emulator = BOARDS[name][1]()
     with Plugged(None, path, only_baud=baud) as board:
-        ended = threading.Event()
 
-        def feed() -> None:
+        def feed(ended: threading.Event) -> None:
             for _ in range(20_000):
                 for packet in emulator.packets(moving(1)):
                     board.send(packet)
                 if ended.wait(0.01):
                     return
 
-        thread = threading.Thread(target=feed)
-        thread.start()
-        try:
+        with beside(feed):
             yield
-        finally:
-            ended.set()
-            thread.join()
 
 
 @pytest.mark.parametrize("name", BOARDS)
