@@ -116,7 +116,7 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
         except HilError as error:
             _tell(report, {"failed": str(error)})
             return
-        _warm_up(station)
+        _warm_up(station, taps.states)
         publisher = _Publisher(taps, station, hub)
         stack.callback(publisher.close)
         publisher.run(stop, report)
@@ -309,9 +309,10 @@ def _obey(command: str, control: Control) -> None:
         control.request_align()
 
 
-def _warm_up(station: Station) -> None:
-    """Compile or load every kernel before the first message is due."""
+def _warm_up(station: Station, states: Ring) -> None:
+    """Compile or load every kernel before the first message is due, and before the first beat."""
     station.geoid(0.0, 0.0)
+    states.latest(np.zeros(1, NAV_STATE))
 
 
 def _tell(report: Connection, what: dict[str, Any]) -> None:
