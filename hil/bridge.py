@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers import FrameDriver, make_driver
-from drivers.can.aiding import AidingDecoder, is_aiding
+from drivers.can.aiding import AidingDecoder, has_aiding, is_aiding
 from drivers.can.frames import FrameArray, frames
 from drivers.logs.recording import EVENT, MARK, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
@@ -35,7 +35,7 @@ from hil.feed.tap import Gate
 from hil.health import HEALTH, HealthWriter
 from hil.magnetometer import correct
 from hil.other_attitude import Estimator, OtherAttitude
-from hil.realtime import claim
+from hil.realtime import claim, rest
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
@@ -186,17 +186,18 @@ class Loop:
     def take(self, batch: FrameArray) -> bool:
         """Decode and navigate a batch of frames; True when it held a sample."""
         driver, got, start = self.driver, False, 0
-        self._health.count(batch)
         while driver.period_s is None and start < len(batch):  # one by one until the board has said what it is
             got = self._between(batch[start : start + 1]) or got
             start += 1
-        return self._between(batch[start:]) or got
+        got = self._between(batch[start:] if start else batch) or got
+        self._health.count(batch)
+        return got
 
     def _between(self, batch: FrameArray) -> bool:
         """Take frames, the measurements among them in their place between the samples."""
-        aided = is_aiding(batch["can_id"])
-        if np.count_nonzero(aided) == 0:
+        if not has_aiding(batch["can_id"]):
             return len(batch) > 0 and self._take(batch)
+        aided = is_aiding(batch["can_id"])
         rows, places = self._aiding.decode(batch, self._now)
         if self._magnetometer is not None:
             correct(self._magnetometer, rows)
@@ -299,7 +300,6 @@ class Loop:
                 raw = raw.rows(0, int(np.searchsorted(raw.time, end, "right")))
         if len(raw):
             self._covered = float(raw.time[-1]) - self._started
-            self._outlets.stats["covered_us"] = round(self._covered * 1e6)
         return raw
 
     def _begin(self, raw: HeadIncrements | ImuIncrements) -> bool:
@@ -369,6 +369,7 @@ class Loop:
         counters = self.driver.counters
         counts = counters.as_list()
         self._outlets.stats.set_block("frames", counts)
+        self._outlets.stats["covered_us"] = round(self._covered * 1e6)
         self._outlets.stats["samples"] = self.samples  # not those of the last batch that lie beyond the duration
         self._outlets.control.set_loss(counters.lost, self.samples)
         for said in self._watch.look(batch, counts, self._now or 0.0):
@@ -448,7 +449,7 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
                 loop.navigator.tell(0.0, "warning", lack)
             outlets.control.loop_begins()
             stats["phase"] = Phase.READY
-            _run(loop, source, order, outlets)
+            _run(loop, source, order, outlets, looks=granted is not None and granted.processor >= 0 and source.live)
         finally:
             source.close()
         result = loop.result() | {"overflowed": source.overflowed}
@@ -467,18 +468,19 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         answer.close()
 
 
-def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None:
+def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, looks: bool) -> None:
     batch = frames(BATCH)
     silence_ns = round(order.scenario.navigation.silence_s * 1e9)
     wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
     heard: int | None = None
+    look_until = 0
     stats, control = outlets.stats, outlets.control
     relayed, relayed_numbers = frames(BATCH), [0] * len(outlets.aiding)
     trouble = ""
     while not (control.stop or loop.finished or source.exhausted):
         if outlets.gate is not None:
             outlets.gate.wait(outlets.states, outlets.states.capacity // 2, lambda: control.stop)
-        n = source.receive(batch, wait)
+        n = source.receive(batch, 0.0 if time.monotonic_ns() < look_until else wait)
         now = time.monotonic_ns()
         stats["beat_ns"] = now
         if source.trouble != trouble:
@@ -486,8 +488,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
             loop.say("error" if trouble else "notice", trouble or f"{order.scenario.bus} is back", station=True)
         if n:
             taken, samples = batch[:n], loop.samples
-            if source.live:
-                stats.count(Times.WAKE, time.time_ns() - int(taken["time_ns"][n - 1]))
+            woken_ns = time.time_ns() - int(taken["time_ns"][n - 1]) if source.live else 0
             _record(taken, outlets, order.paced)
             if order.file is not None and taken["reserved"][:, 0].any():
                 got = take_with_events(loop, taken)
@@ -498,6 +499,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
                 stats["phase"] = Phase.RUNNING
             if source.live:
                 took = time.monotonic_ns() - now
+                stats.count(Times.WAKE, woken_ns)
                 stats.count(Times.ROUND, took)
                 if got and took > 1e9 * (loop.samples - samples) * (loop.driver.period_s or math.inf):
                     stats["overruns"] += 1
@@ -514,6 +516,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets) -> None
         if event:
             _record(event_record(event, time.time_ns()), outlets, order.paced)
             loop.obey(event)
+        if looks and heard == now:
+            look_until = rest(loop.driver.period_s)
     if outlets.gate is not None:
         outlets.gate.wait(outlets.states, 0, lambda: control.stop)
 

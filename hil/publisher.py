@@ -35,6 +35,7 @@ from hil.stats import Stats
 from nav.aiding import AIDING
 from nav.errors import HilError
 from nav.state import NAV_STATE
+from nav.turn import euler_of
 
 _SILENCE_S = 1.0
 """Without a solution for this long the status says so, whatever the last solution said."""
@@ -137,7 +138,7 @@ class _Publisher:
         self._events, self._event_number = taps.events, 0
         self._notes = np.zeros(16, taps.events.dtype)
         self._seen = 0
-        self._read_s = -math.inf
+        self._read_s = self._heard_s = -math.inf
         self._silent = False
         self._ages_ns = np.zeros(_AGES, np.int64)
         self._aged = 0
@@ -194,6 +195,9 @@ class _Publisher:
         if called or now_s - self._read_s > _READ_S:
             self._read(now_s)
         next_s = self._poll(now_s)
+        if now_s - self._heard_s > _READ_S:  # behind what is due: that may not wait
+            self._heard_s = now_s
+            self._hear()
         if self._links is not None and now_s - self._told_s > _TELL_S:
             self._told_s = now_s
             self._links.tell(self._hub.tallies())
@@ -222,6 +226,9 @@ class _Publisher:
         elif self._seen and not self._silent and now_s - self._read_s > _SILENCE_S:
             self._silent = True
             self._station.silence()
+
+    def _hear(self) -> None:
+        """Have told what else the loop says."""
         self._station.set_loss(self._control.lost, self._control.samples)
         if self._stats is not None:
             self._station.set_clock(clock_reading(self._stats))
@@ -312,6 +319,7 @@ def _obey(command: str, control: Control) -> None:
 def _warm_up(station: Station, states: Ring) -> None:
     """Compile or load every kernel before the first message is due, and before the first beat."""
     station.geoid(0.0, 0.0)
+    euler_of(1.0, 0.0, 0.0, 0.0)
     states.latest(np.zeros(1, NAV_STATE))
 
 

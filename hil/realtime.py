@@ -1,17 +1,19 @@
 """What ``--realtime`` asks of the kernel: a priority above all ordinary processes, locked memory, a processor for the loop.
 
 Each is taken where it is permitted; what is not is said with the command that mends it. The garbage collector is frozen in
-every run.
+every run. On a processor of its own the loop does not wait to be woken for the next sample: it looks for it (`rest`).
 """
 
 import ctypes
 import os
+import time
 from dataclasses import dataclass, field
 from typing import Any
 
 PRIORITY = 50
 """Of the loop under SCHED_FIFO: below the kernel's own threads that serve interrupts."""
 _LOCK_ALL = 3  # MCL_CURRENT | MCL_FUTURE
+REST, SHORTEST_S = 0.25, 0.0005
 LIMITS = (
     "put '@realtime - rtprio 90' and '@realtime - memlock unlimited' into /etc/security/limits.d and join that group"
 )
@@ -63,6 +65,19 @@ def claim() -> Granted:
     else:
         granted.lacking.append("one processor only: the loop shares it with all others")
     return granted
+
+
+def rest(period_s: float | None) -> int:
+    """Sleep for `REST` of the period, as the kernel wants of those that have priority; until when to look for the next sample.
+
+    Waking costs more than a sample does. The answer is in ns of the monotonic clock, 0 where looking does not pay: the period
+    is not known, or samples come so fast that the loop has no rest.
+    """
+    if period_s is None or period_s < SHORTEST_S:
+        return 0
+    began = time.monotonic_ns()
+    time.sleep(REST * period_s)
+    return began + round(2e9 * period_s)
 
 
 def step_aside() -> None:

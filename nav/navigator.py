@@ -322,7 +322,7 @@ class Navigator:
 
     def _run(self, imu: ImuIncrements, start: int, stop: int) -> None:
         while start < stop:
-            end = _same_flags(imu.validity, start, stop)
+            end = stop if stop - start == 1 else _same_flags(imu.validity, start, stop)
             flagged = int(imu.validity[start]) & _FLAGS
             if flagged != self._flagged:
                 self._flag(float(imu.time[start]), flagged)
@@ -392,7 +392,7 @@ class Navigator:
         n, before = len(imu), self._core.mechanization
         if self._aided is None:
             out = self._solutions.answers(n)
-            done = self._core.advance(imu.step, imu.dtheta, imu.dvel, self.gyro_bias, *out)
+            done = self._core.carry(imu.step, imu.dtheta, imu.dvel, self.gyro_bias, out)
         else:
             out = self._aided.process(imu)
             self.gyro_bias = self._aided.estimates[GYRO_BIAS].copy()

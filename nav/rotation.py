@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 
 from nav.errors import HilError
 from nav.increments import FloatArray
+from nav.kernel import kernel
+from nav.turn import euler_of
 
 DEFECT = 1e-6
 """Largest element of C C' - I that is taken for rounding."""
-LOCK = 1e-12
-"""Gimbal lock: half of the distance of pitch from +-90 deg, rad, below which heading takes the whole turn."""
 
 
 def product(p: ArrayLike, q: ArrayLike) -> FloatArray:
@@ -157,23 +157,17 @@ def quaternion_from_euler(heading: ArrayLike, pitch: ArrayLike, roll: ArrayLike)
 
 
 def euler_from_quaternion(q: ArrayLike) -> FloatArray:
-    """(..., 3) heading [0, 2 pi), pitch, roll (-pi, pi] of q_nb, rad.
+    """(..., 3) heading [0, 2 pi), pitch, roll (-pi, pi] of q_nb, rad; see :func:`nav.turn.euler_of`."""
+    unit = np.ascontiguousarray(normalised(q))
+    angles = np.empty((*unit.shape[:-1], 3))
+    _eulers(unit.reshape(-1, 4), angles.reshape(-1, 3))
+    return angles
 
-    The half sum and the half difference of heading and roll are angles of the quaternion's parts, and the lengths of these
-    parts are the sine and cosine of half the distance of pitch from -90 deg: nothing loses digits near the vertical. At
-    `LOCK` heading takes the whole turn and roll is 0.
-    """
-    w, x, y, z = np.moveaxis(normalised(q), -1, 0)
-    plus, minus = np.arctan2(x + z, w - y), np.arctan2(z - x, w + y)
-    below, above = np.hypot(w + y, z - x), np.hypot(w - y, x + z)
-    pitch = np.arctan2(2.0 * (w * y - x * z), below * above)
-    locked_up, locked_down = above < LOCK, below < LOCK
-    heading = np.where(locked_up, 2.0 * minus, np.where(locked_down, 2.0 * plus, plus + minus))
-    roll = np.where(locked_up | locked_down, 0.0, plus - minus)
-    roll -= 2.0 * np.pi * np.ceil(roll / (2.0 * np.pi) - 0.5)
-    heading = np.remainder(heading, 2.0 * np.pi)
-    heading = np.where(heading < 2.0 * np.pi, heading, 0.0)  # the remainder of a tiny negative angle rounds up
-    return np.stack([heading, pitch, roll], axis=-1)
+
+@kernel
+def _eulers(q: FloatArray, angles: FloatArray) -> None:
+    for k in range(q.shape[0]):
+        angles[k, 0], angles[k, 1], angles[k, 2] = euler_of(q[k, 0], q[k, 1], q[k, 2], q[k, 3])
 
 
 def dcm_from_rotation_vector(phi: ArrayLike) -> FloatArray:

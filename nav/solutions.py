@@ -12,23 +12,11 @@ from nav.state import NAV_STATE
 from nav.strapdown import Answers
 
 StateArray = NDArray[Any]
-_STATE = ("mode", "health", "progress", "lat", "lon", "height", "vel_n", "q_nb", "gyro_bias", "sigma", "test_ratio")
-_SAMPLE = ("time", "sequence", "gyro_bias", "w_ib_b", "f_b")
 
 
 @kernel
 def _fill(
-    mode: NDArray[np.int32],
-    health: NDArray[np.int32],
-    progress: FloatArray,
-    lat: FloatArray,
-    lon: FloatArray,
-    height: FloatArray,
-    vel_n: FloatArray,
-    q_nb: FloatArray,
-    gyro_bias: FloatArray,
-    sigma: NDArray[np.float32],
-    test_ratio: NDArray[np.float32],
+    rows: StateArray,
     start: int,
     stop: int,
     what: tuple[int, int, float],
@@ -40,39 +28,30 @@ def _fill(
     ratios: NDArray[np.float32],
 ) -> None:
     for k in range(start, stop):
-        i = min(k - start, position.shape[0] - 1)
-        mode[k], health[k], progress[k] = what
-        lat[k], lon[k], height[k] = position[i, 0], position[i, 1], position[i, 2]
+        i, row = min(k - start, position.shape[0] - 1), rows[k]
+        row.mode, row.health, row.progress = what
+        row.lat, row.lon, row.height = position[i, 0], position[i, 1], position[i, 2]
         for j in range(3):
-            vel_n[k, j], gyro_bias[k, j] = velocity[i, j], bias[j]
+            row.vel_n[j], row.gyro_bias[j] = velocity[i, j], bias[j]
         for j in range(4):
-            q_nb[k, j] = attitude[i, j]
+            row.q_nb[j] = attitude[i, j]
         for j in range(sigmas.shape[0]):
-            sigma[k, j] = sigmas[j]
+            row.sigma[j] = sigmas[j]
         for j in range(ratios.shape[0]):
-            test_ratio[k, j] = ratios[j]
+            row.test_ratio[j] = ratios[j]
 
 
 @kernel
 def _add_samples(
-    times: FloatArray,
-    sequences: IntArray,
-    gyro_bias: FloatArray,
-    w_ib_b: FloatArray,
-    f_b: FloatArray,
-    time: FloatArray,
-    step: FloatArray,
-    dtheta: FloatArray,
-    dvel: FloatArray,
-    sequence: IntArray,
+    rows: StateArray, time: FloatArray, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, sequence: IntArray
 ) -> None:
     for i in range(time.shape[0]):
-        k = i + 1
-        times[k], sequences[k] = time[i], sequence[i]
+        row = rows[i + 1]
+        row.time, row.sequence = time[i], sequence[i]
         t = step[i] if step[i] > 0.0 else 1.0
         for j in range(3):
-            w_ib_b[k, j] = dtheta[i, j] / t - gyro_bias[k, j]
-            f_b[k, j] = dvel[i, j] / t
+            row.w_ib_b[j] = dtheta[i, j] / t - row.gyro_bias[j]
+            row.f_b[j] = dvel[i, j] / t
 
 
 class Solutions:
@@ -123,13 +102,11 @@ class Solutions:
         worth : tuple of (9,), (len(Ratio),) float32
             Sigmas and test ratios.
         """
-        arguments: Any = (*self._state, start + 1, stop + 1, what, *answers, gyro_bias, *worth)
-        _fill(*arguments)
+        _fill(self._rows, start + 1, stop + 1, what, *answers, gyro_bias, *worth)
 
     def add_samples(self, imu: ImuIncrements) -> None:
         """Time, number, rate and force of every row, from samples from which the bias is not taken off yet."""
-        arguments: Any = (*self._sample, imu.time, imu.step, imu.dtheta, imu.dvel, imu.sequence)
-        _add_samples(*arguments)
+        _add_samples(self._rows, imu.time, imu.step, imu.dtheta, imu.dvel, imu.sequence)
 
     def keep_last(self, n: int) -> None:
         """The last of `n` rows is what `last` gives."""
@@ -140,5 +117,3 @@ class Solutions:
         rows, scratch = self._rows, (np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 4)))
         self._views = Cut[StateArray](lambda m: rows[1 : m + 1])
         self._answers = Cut(lambda m: Answers(*(array[:m] for array in scratch)))
-        self._state = tuple(self._rows[name] for name in _STATE)
-        self._sample = tuple(self._rows[name] for name in _SAMPLE)

@@ -274,7 +274,7 @@ class Strapdown:
             A shape does not fit, or an increment is not a number: nothing has changed. Or one was so large that the answer
             is not a number: `start` again.
         """
-        n = alone = len(step)
+        n = len(step)
         step, gyro_bias = read_array("step", step, n), read_array("gyro_bias", gyro_bias, 3)
         dtheta, dvel = read_array("dtheta", dtheta, n, 3), read_array("dvel", dvel, n, 3)
         check_room("position", position, n, 3)
@@ -284,9 +284,20 @@ class Strapdown:
         if bad >= 0 or not math.isfinite(gyro_bias[0] + gyro_bias[1] + gyro_bias[2]):
             what = "the gyro bias" if bad < 0 else f"increment {bad} of the batch"
             raise HilError(f"strapdown: {what} is not a number: mend the driver or the file")
+        return self.carry(step, dtheta, dvel, gyro_bias, Answers(position, velocity, attitude))
+
+    def carry(self, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, gyro_bias: FloatArray, out: Answers) -> int:
+        """`advance` without its checks: all arrays are contiguous floats (float64) that fit, and all values are numbers.
+
+        Raises
+        ------
+        HilError
+            An increment was so large that the answer is not a number: `start` again.
+        """
+        n = alone = len(step)
+        position, velocity, attitude = out
         if n > len(self._body[0]):
             self._room(2 * n)
-        out = Answers(position, velocity, attitude)
         done = 0
         while done < n and self._lead is not None:
             one = slice(done, done + 1)

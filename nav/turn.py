@@ -11,6 +11,8 @@ from nav.increments import FloatArray
 from nav.kernel import inline_kernel, kernel
 
 Quaternion = tuple[float, float, float, float]
+LOCK = 1e-12
+"""Gimbal lock: half of the distance of pitch from +-90 deg, rad, below which heading takes the whole turn."""
 
 
 @inline_kernel
@@ -69,6 +71,27 @@ def change_by_turn(x: float, y: float, z: float, vx: float, vy: float, vz: float
     tx, ty, tz = cross(x, y, z, vx, vy, vz)
     ux, uy, uz = cross(x, y, z, tx, ty, tz)
     return s * tx + c * ux, s * ty + c * uy, s * tz + c * uz
+
+
+@inline_kernel
+def euler_of(w: float, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Heading [0, 2 pi), pitch, roll (-pi, pi] of a quaternion q_nb, rad.
+
+    The half sum and the half difference of heading and roll are angles of the quaternion's parts, and the lengths of these
+    parts are the sine and cosine of half the distance of pitch from -90 deg: nothing loses digits near the vertical. At
+    `LOCK` heading takes the whole turn and roll is 0.
+    """
+    plus, minus = math.atan2(x + z, w - y), math.atan2(z - x, w + y)
+    below, above = math.hypot(w + y, z - x), math.hypot(w - y, x + z)
+    pitch = math.atan2(2.0 * (w * y - x * z), below * above)
+    heading, roll = plus + minus, plus - minus
+    if above < LOCK:
+        heading, roll = 2.0 * minus, 0.0
+    elif below < LOCK:
+        heading, roll = 2.0 * plus, 0.0
+    roll -= 2.0 * math.pi * math.ceil(roll / (2.0 * math.pi) - 0.5)
+    heading %= 2.0 * math.pi
+    return heading if heading < 2.0 * math.pi else 0.0, pitch, roll  # that of a tiny negative angle rounds up
 
 
 @kernel

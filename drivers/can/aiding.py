@@ -20,6 +20,7 @@ from drivers.can.integrity import Protection, protection
 from nav.aiding import AIDING, AT_PORTS, RELAYED, Kind
 from nav.errors import HilError
 from nav.increments import FloatArray, IntArray
+from nav.kernel import kernel
 
 PROTOCOL = 1
 """Version of the message set."""
@@ -65,6 +66,15 @@ def _messages() -> dict[Kind, _Message]:
 def is_aiding(can_ids: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """Whether each identifier (with its flags) is one of those reserved for aiding."""
     found: NDArray[np.bool_] = (can_ids & np.uint32(0xFFFFFFFF - (RESERVED_IDS - 1))) == FIRST_ID
+    return found
+
+
+@kernel
+def has_aiding(can_ids: NDArray[np.uint32]) -> bool:
+    """Whether there is one among identifiers."""
+    found = False
+    for can_id in can_ids:
+        found |= can_id & (0xFFFFFFFF - (RESERVED_IDS - 1)) == FIRST_ID
     return found
 
 

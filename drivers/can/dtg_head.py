@@ -326,18 +326,15 @@ class DtgHead:
         _fill(count, self._rows, values, said, times, *sensed, self._times)
         result = self._views[count]
         self._arrivals = self._times[:count]
-        counters, outcome = self.counters, self._outcome
-        counters.samples, counters.lost, counters.late = (
-            int(outcome[_SAMPLES]),
-            int(outcome[_LOST]),
-            int(outcome[_LATE]),
-        )
-        counters.restarts, counters.frozen = int(outcome[_RESTARTS]), int(outcome[_FROZEN])
-        counters.clock_steps = int(outcome[_CLOCK_STEPS])
-        counters.duplicated += int(outcome[_DUPLICATED])
-        counters.crc_errors += int(outcome[_CRC])
-        counters.version_errors += int(outcome[_VERSION])
-        outcome[_DUPLICATED] = outcome[_CRC] = outcome[_VERSION] = 0
+        counters, outcome = self.counters, self._outcome.tolist()
+        counters.samples, counters.lost, counters.late = outcome[_SAMPLES], outcome[_LOST], outcome[_LATE]
+        counters.restarts, counters.frozen = outcome[_RESTARTS], outcome[_FROZEN]
+        counters.clock_steps = outcome[_CLOCK_STEPS]
+        if outcome[_DUPLICATED] or outcome[_CRC] or outcome[_VERSION]:
+            counters.duplicated += outcome[_DUPLICATED]
+            counters.crc_errors += outcome[_CRC]
+            counters.version_errors += outcome[_VERSION]
+            self._outcome[[_DUPLICATED, _CRC, _VERSION]] = 0
         return result
 
     def _others(self, batch: FrameArray, chosen: IntArray, said: FloatArray) -> None:

@@ -10,8 +10,8 @@ from functools import cached_property
 from typing import Any
 
 from nav.earth import E2, RATE, A
-from nav.rotation import euler_from_quaternion
 from nav.state import Health, Mode
+from nav.turn import euler_of
 
 Vector = tuple[float, float, float]
 Undulation = Callable[[float, float], float]
@@ -106,8 +106,7 @@ class Solution:
     @cached_property
     def euler(self) -> Vector:
         """Heading [0, 2 pi), pitch, roll, rad."""
-        heading, pitch, roll = euler_from_quaternion(self.q_nb).tolist()
-        return heading, pitch, roll
+        return euler_of(*self.q_nb)
 
     @cached_property
     def altitude(self) -> float:

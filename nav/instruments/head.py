@@ -177,6 +177,8 @@ class HeadCombiner:
 
     def notes(self) -> list[Note]:
         """What happened since the last call."""
+        if not self._notes:
+            return []
         notes, self._notes = self._notes, []
         return sorted(notes, key=lambda note: note.time)
 
@@ -201,8 +203,8 @@ class HeadCombiner:
         while start < n:
             if said[start] != self._status:
                 self._take_status(float(head.time[start]), int(said[start]))
-            stop = _same_until(said, start)
-            before = self.faults.copy()
+            stop = n if n - start == 1 else _same_until(said, start)
+            before = self.faults.tobytes()
             sent, clean, residual = head, gyro, self.residual
             if start > 0 or stop < n:
                 sent, clean, residual = head.rows(start, stop), gyro[start:stop], residual[start:stop]
@@ -211,8 +213,8 @@ class HeadCombiner:
             done = redundancy.examine(self._memory, self.faults, *seen, *tests, residual)
             _combine(clean[:done], self._inverse, self._flag, dtheta[start:], validity[start:])
             start += done
-            if self.faults.tobytes() != before.tobytes():
-                self._tell(float(head.time[start - 1]), before)
+            if self.faults.tobytes() != before:
+                self._tell(float(head.time[start - 1]), np.frombuffer(before, np.int64))
         if self._size is not None:
             take_off_size_effect(self._size_memory, self._size, head.step, dtheta, dvel, dvel)
         _turn(self._c_bh, dtheta, dvel)
