@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from hil.bridge import LoopOrder
 from hil.publisher import LOOP_DIED
 from hil.pytest_plugin import StartBridge
-from hil.realtime import PRIORITY, refused
+from hil.realtime import PRIORITY, REST, refused, rest
 from hil.ring import Shared
 from hil.scenario import Scenario
 from hil.session import STOPPED_S, Session, simulated_head
@@ -173,6 +173,46 @@ def test_a_run_in_real_time_says_what_it_got(hil_bridge: StartBridge) -> None:
         assert 0.0 < times[what]["p50"] <= times[what]["p99"] <= times[what]["max"]
     assert times["wake"]["p50"] < times["latency"]["p50"]
     assert summary["overruns"] >= 0
+
+
+def processor_time_s(pid: int) -> float:
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) == 1, reason="one processor: the loop has none for itself")
+def test_a_loop_that_looks_for_samples_rests_when_none_come(hil_bridge: StartBridge) -> None:
+    bridge = hil_bridge(navigation=TRUTH, head={"rate_hz": 1000}, realtime=True)
+    bridge.wait_mode("navigate")
+    loop = pid_of(bridge.session, "loop")
+
+    def share(over_s: float) -> float:
+        before = processor_time_s(loop)
+        time.sleep(over_s)
+        return (processor_time_s(loop) - before) / over_s
+
+    assert share(1.0) < 0.95, "the kernel stops who takes more"
+    head = pid_of(bridge.session, "feeder")
+    os.kill(head, signal.SIGSTOP)
+    try:
+        time.sleep(0.3)
+        assert share(1.0) < 0.3
+    finally:
+        os.kill(head, signal.SIGCONT)
+    bridge.stop()
+    bridge.wait_end(30)
+
+
+@pytest.mark.parametrize("period_s", [None, 1e-4, 4.9e-4])
+def test_looking_does_not_pay_before_the_period_is_known_or_where_there_is_no_rest(period_s: float | None) -> None:
+    assert rest(period_s) == 0
+
+
+def test_a_rest_is_a_part_of_the_period() -> None:
+    before = time.monotonic_ns()
+    until = rest(0.02)
+    assert time.monotonic_ns() - before >= REST * 0.02e9
+    assert 0.04e9 <= until - before < 0.05e9
 
 
 def test_an_overrun_is_a_round_longer_than_its_samples(hil_bridge: StartBridge) -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.can.aiding import AidingDecoder, AidingEncoder, aiding_database_text, is_aiding, merge
+from drivers.can.aiding import AidingDecoder, AidingEncoder, aiding_database_text, has_aiding, is_aiding, merge
 from drivers.can.codec import load_database
 from drivers.can.dtg_head import DtgHead
 from drivers.can.dtg_head_emulator import HeadEncoder
@@ -184,6 +184,13 @@ def test_the_heads_driver_passes_over_them(layout):
 def test_reserved_ids_are_plain_ones(flag):
     assert is_aiding(np.arange(0x150, 0x160, dtype=np.uint32)).all()
     assert not is_aiding(np.array([0x14F, 0x160, 0x155 | flag], np.uint32)).any()
+
+
+@given(st.lists(st.sampled_from([0x14F, 0x150, 0x15F, 0x160, 0x155 | EFF]), max_size=4))
+def test_one_reserved_id_among_others_is_seen(ids):
+    batch = frames(len(ids))
+    batch["can_id"] = ids
+    assert has_aiding(batch["can_id"]) == is_aiding(batch["can_id"]).any()
 
 
 def test_length_on_the_wire_is_one_that_can_fd_has():
