@@ -44,6 +44,7 @@ _READ_S = 0.1
 _AGES = 1 << 16
 """How many ages of solutions are kept for the statistics."""
 LOOP_DIED = "the navigation loop died: no solutions any more"
+_LOOK_S = 0.002
 _TELL_S = 0.2
 """What went over the links is told so often."""
 
@@ -72,6 +73,8 @@ class Taps:
         Of `AIDING`: what receivers have measured.
     links : LinkStats, optional
         Told a few times a second what went over the links.
+    looks : bool
+        The publisher looks for a solution that is due instead of waiting to be woken.
     """
 
     states: Ring
@@ -83,6 +86,7 @@ class Taps:
     stats: Stats | None = None
     fixes: Ring | None = None
     links: LinkStats | None = None
+    looks: bool = False
 
 
 def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connection) -> None:
@@ -129,7 +133,7 @@ class _Publisher:
 
     def __init__(self, taps: Taps, station: Station, hub: Hub) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
-        self._stats = taps.stats
+        self._stats, self._looks = taps.stats, taps.looks
         self._links, self._told_s = taps.links, -math.inf
         self._station, self._hub = station, hub
         station.on_attitude = self._attitude_sent
@@ -201,11 +205,19 @@ class _Publisher:
         if self._links is not None and now_s - self._told_s > _TELL_S:
             self._told_s = now_s
             self._links.tell(self._hub.tallies())
-        if self._hungry() and self._ring.count - self._seen == 1:  # a slow sensor: do not wait for its next solution
+        slow = self._ring.count - self._seen == 1  # do not wait for its next solution
+        if self._hungry() and (slow or (self._looks and self._look())):
             self._read(now_s)
             next_s = self._poll(now_s)
         self._watch(self._hungry())
         return next_s
+
+    def _look(self) -> bool:
+        """Whether the next solution comes within `_LOOK_S`, while nobody else wants this processor."""
+        newest, until = self._ring.count, time.monotonic() + _LOOK_S
+        while self._ring.count == newest and time.monotonic() < until:
+            os.sched_yield()
+        return self._ring.count != newest
 
     def _hungry(self) -> bool:
         return any(endpoint.waits for endpoint in self._hub.endpoints)

@@ -190,7 +190,7 @@ class Session:
             self._window.socket.close()  # the port lives as long as its process
         if self._publish and scenario.mavlink.links:
             network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
-            shared = outlets.stats, outlets.fixes, self.links
+            shared = outlets.stats, outlets.fixes, self.links, self.order.realtime and self.order.live
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
         self.feeds.launch(launch, outlets.states, 1)
