@@ -22,6 +22,7 @@ AID_HEADER = (
     *(f"sigma_{k}" for k in range(1, 7)),
 )
 _FIRST_VALUE, _FIRST_SIGMA = 3, 9
+_LAST_SOURCE = int(np.iinfo(AIDING["source"]).max)
 _DEG = math.pi / 180.0
 
 
@@ -115,8 +116,8 @@ class _Line:
         units, time, source = UNITS[kind], self._number(0), self._number(2)
         if time is None:
             raise self._refusal(0, "a time is needed")
-        if source is None or source < 0 or source % 1.0:
-            raise self._refusal(2, "expected a whole number from 0 on")
+        if source is None or source % 1.0 or not 0 <= source <= _LAST_SOURCE:
+            raise self._refusal(2, f"expected a whole number in 0..{_LAST_SOURCE}")
         values = self._numbers(_FIRST_VALUE, units.values, kind)
         sigmas = self._numbers(_FIRST_SIGMA, units.sigmas, kind)
         self._check(kind, values, sigmas)

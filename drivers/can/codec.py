@@ -86,7 +86,7 @@ class MessageCodec:
         return {signal.name: j for j, signal in enumerate(self.signals)}
 
     @cached_property
-    def _table(self) -> Integers:
+    def table(self) -> Integers:
         """A row a signal, in one array of two kinds: a call with one argument less is faster."""
         table = np.zeros((len(self.signals), 12), np.int64)
         for row, signal in zip(table, self.signals, strict=True):
@@ -96,13 +96,13 @@ class MessageCodec:
 
     def decode(self, data: Payloads, out: Doubles) -> Doubles:
         """Physical values in the units of the DBC; a multiplexed signal that is absent is NaN."""
-        if _decode(data, self._table, self.length, out) != _DONE:
+        if decode_rows(data, self.table, self.length, out) != _DONE:
             self._refuse(data, out)
         return out
 
     def decode_raw(self, data: Payloads, out: Integers) -> Integers:
         """Raw integers: unsigned 64-bit ones as their two's complement, floats as their bits, absent ones 0."""
-        if _decode_raw(data, self._table, self.length, out) != _DONE:
+        if _decode_raw(data, self.table, self.length, out) != _DONE:
             self._refuse(data, out)
         return out
 
@@ -115,14 +115,14 @@ class MessageCodec:
             A value is not finite, or does not fit the bits of its signal. (The DBC's minimum and maximum are not
             looked at: many files state them wrongly.) The rows before it are written by then.
         """
-        failure = _encode(values, self._table, self.length, out)
+        failure = _encode(values, self.table, self.length, out)
         if failure != _DONE:
             self._refuse(out, values, failure)
         return out
 
     def encode_raw(self, values: Integers, out: Payloads) -> Payloads:
         """Write raw integers, as `decode_raw` gives them, into the first `length` bytes; errors as in `encode`."""
-        failure = _encode_raw(values, self._table, self.length, out)
+        failure = _encode_raw(values, self.table, self.length, out)
         if failure != _DONE:
             self._refuse(out, values, failure)
         return out
@@ -335,7 +335,8 @@ def _put(out: Payloads, i: int, table: Integers, j: int, bits: np.uint64) -> Non
 
 
 @kernel
-def _decode(data: Payloads, table: Integers, length: int, out: Doubles) -> int:
+def decode_rows(data: Payloads, table: Integers, length: int, out: Doubles) -> int:
+    """`MessageCodec.decode` of a message's `table` and `length`, for kernels; 0 when all fits."""
     if _misfit(data, table, length, out):
         return _MISFIT
     scaling = table.view(np.float64)

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from drivers import Counters
 from drivers.can.aiding import is_aiding
-from drivers.can.codec import Database, MessageCodec, load_database
+from drivers.can.codec import Database, MessageCodec, decode_rows, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray, as_bytes
-from drivers.can.integrity import Protection, protection
+from drivers.can.integrity import Protection, p05_check, protection
 from drivers.can.samples import signed
 from nav.cut import Cut
 from nav.errors import HilError
@@ -50,6 +50,9 @@ _FD_SIGNALS = (
     *(f"rotor_{axis}" for axis in _AXES),
     *("dvel_x", "dvel_y", "dvel_z"),
 )
+_Work = tuple[NDArray[np.uint8], FloatArray, FloatArray, NDArray[np.bool_], FloatArray, IntArray, IntArray, IntArray]
+"""Payloads, values in the order of the DBC and in ours, checks, what was said, stamps; rows and stamps of samples."""
+_Sensed = tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray, FloatArray]
 # State of the tracker.
 _STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN = range(6)
 # Outcomes of the tracker.
@@ -181,11 +184,11 @@ def _fill(
         arrivals[n] = times[k]
 
 
-@kernel
+@inline_kernel
 def _are_samples(
-    frames: NDArray[np.uint8], can_id: int, now: FloatArray, data: NDArray[np.uint8], said: FloatArray
+    frames: NDArray[np.uint8], can_id: int, now: FloatArray, data: NDArray[np.uint8], said: FloatArray, stamps: IntArray
 ) -> bool:
-    """Whether all `frames` (n, 80) are FD samples; then their payloads and what was said lie in `data` and `said`."""
+    """Whether all `frames` (n, 80) are FD samples; then their payloads, stamps and what was said are taken over."""
     for k in range(frames.shape[0]):
         found = frames[k, 8] | frames[k, 9] << 8 | frames[k, 10] << 16 | frames[k, 11] << 24
         if found != can_id or frames[k, 12] != 64 or frames[k, 13] & FDF == 0:
@@ -194,6 +197,10 @@ def _are_samples(
             data[k, i] = frames[k, 16 + i]
         for i in range(_SAID):
             said[k, i] = now[i]
+        stamp = 0
+        for i in range(8):
+            stamp |= np.int64(frames[k, i]) << (8 * i)
+        stamps[k] = stamp
     return True
 
 
@@ -202,6 +209,38 @@ def _reorder(raw: FloatArray, columns: IntArray, values: FloatArray) -> None:
     for k in range(raw.shape[0]):
         for i in range(columns.shape[0]):
             values[k, i] = raw[k, columns[i]]
+
+
+@kernel
+def _take(
+    frames: NDArray[np.uint8],
+    what: tuple[int, int, int, int],
+    now: FloatArray,
+    table: IntArray,
+    columns: IntArray,
+    work: _Work,
+    state: IntArray,
+    outcome: IntArray,
+    samples: tuple[FloatArray, FloatArray, IntArray, IntArray],
+    sensed: _Sensed,
+) -> int:
+    """The accepted samples of frames (n, 80) that are all FD samples; -1, and nothing has changed, when they are not.
+
+    `what`: identifier, length, data id and counter modulus of the message.
+    """
+    n = frames.shape[0]
+    data, raw, values, good, said, stamps, rows, times = work
+    can_id, length, data_id, modulus = what
+    if not _are_samples(frames, can_id, now, data, said, stamps):
+        return -1
+    p05_check(data[:n], length, data_id, modulus, good[:n])
+    decode_rows(data[:n], table, length, raw[:n])
+    _reorder(raw[:n], columns, values)
+    time, step, sequence, validity = samples
+    count = _track(values[:n], good, said, state, outcome, time, step, sequence, validity, rows)
+    dtheta, rotor, dvel, status, spin, temperature = sensed
+    _fill(count, rows, values, said, stamps, dtheta, rotor, dvel, validity, status, spin, temperature, times)
+    return count
 
 
 @kernel
@@ -259,6 +298,8 @@ class DtgHead:
             if declared is None:
                 raise HilError(f"dtg_head.dbc: message {name} has no E2EProfile")
             self._protection[name] = declared
+        sample = self._protection["HEAD_SAMPLE"]
+        self._what = self._sample.can_id, sample.length, sample.data_id, sample.counter_modulus
         self._columns = np.array([self._sample.columns[name] for name in _FD_SIGNALS])
         self._kinds = {codec.can_id: k for k, codec in enumerate(self._classic)}
         self.counters = Counters()
@@ -282,7 +323,12 @@ class DtgHead:
         self._good = np.zeros(n, np.bool_)
         self._rows, self._times = np.zeros(n, np.int64), np.zeros(n, np.int64)
         self._views = Cut(partial(self._batch.rows, 0))
-        self._said = np.zeros((n, _SAID))
+        self._said, stamps = np.zeros((n, _SAID)), np.zeros(n, np.int64)
+        received = self._data, self._raw, self._values, self._good, self._said, stamps
+        self._work = *received, self._rows, self._times
+        batch = self._batch
+        self._samples = batch.time, batch.step, batch.sequence, batch.validity
+        self._sensed = batch.dtheta, batch.rotor, batch.dvel, batch.status, batch.spin, batch.temperature
 
     def identity(self) -> dict[str, object]:
         """Serial, hardware, sample period, temperatures, rotor speeds, supply and built-in test, as last heard."""
@@ -298,9 +344,11 @@ class DtgHead:
         if n > len(self._batch):
             self._room(2 * n)
         self.counters.frames += n
+        where = self._work, self._state, self._outcome, self._samples, self._sensed
+        count = _take(as_bytes(batch), self._what, self._now, self._sample.table, self._columns, *where)
+        if count >= 0:
+            return self._counted(count)
         said = self._said[:n]
-        if _are_samples(as_bytes(batch), self._sample.can_id, self._now, self._data, said):
-            return self._samples(n, batch["time_ns"], said)
         ids = batch["can_id"]
         is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
         said[:] = self._now
@@ -308,22 +356,22 @@ class DtgHead:
         chosen = batch[is_sample]
         if len(chosen):
             self._data[: len(chosen)] = chosen["data"]
-            return self._samples(len(chosen), chosen["time_ns"], said[is_sample])
+            n = len(chosen)
+            self._protection["HEAD_SAMPLE"].check(self._data[:n], self._good[:n])
+            self._sample.decode(self._data[:n], self._raw[:n])
+            _reorder(self._raw[:n], self._columns, self._values)
+            return self._accept(n, chosen["time_ns"], said[is_sample])
         return self._classic_samples(batch, said)
 
-    def _samples(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
-        data = self._data[:n]
-        self._protection["HEAD_SAMPLE"].check(data, self._good[:n])
-        self._sample.decode(data, self._raw[:n])
-        _reorder(self._raw[:n], self._columns, self._values)
-        return self._accept(n, times, said)
-
     def _accept(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
-        batch, values = self._batch, self._values[:n]
-        samples = batch.time, batch.step, batch.sequence, batch.validity
-        count = _track(values, self._good[:n], said, self._state, self._outcome, *samples, self._rows)
-        sensed = batch.dtheta, batch.rotor, batch.dvel, batch.validity, batch.status, batch.spin, batch.temperature
+        values, (dtheta, rotor, dvel, status, spin, temperature) = self._values[:n], self._sensed
+        count = _track(values, self._good[:n], said, self._state, self._outcome, *self._samples, self._rows)
+        sensed = dtheta, rotor, dvel, self._batch.validity, status, spin, temperature
         _fill(count, self._rows, values, said, times, *sensed, self._times)
+        return self._counted(count)
+
+    def _counted(self, count: int) -> HeadIncrements:
+        """The samples at the front of the batch, and what became of the others."""
         result = self._views[count]
         self._arrivals = self._times[:count]
         counters, outcome = self.counters, self._outcome.tolist()

@@ -222,6 +222,7 @@ def changed(column, text, kind="gnss"):
         (changed("sigma_2", "0"), "sigma_2 = '0': a sigma must be positive"),
         (changed("value_2", "3", "baro"), "value_2 = '3': baro has 1 of these"),
         (changed("sigma_1", "", "baro"), "sigma_1 = '': baro needs a sigma"),
+        (changed("source", "9" * 30), f"source = '{'9' * 30}': expected a whole number in 0..2147483647"),
         (changed("value_2", "", "attitude"), "value_2 = '': there is a sigma and no value"),
         ([*ALL[0], "7"], "16 columns, expected 15"),
     ],
