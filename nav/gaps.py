@@ -60,14 +60,29 @@ class Gap:
 
 
 class GapFiller:
-    """Fills gaps in a stream of batches."""
+    """Fills gaps in a stream of batches.
+
+    Attributes
+    ----------
+    rate, force : (3,) float
+        Of the last sample, rad/s and m/s^2.
+    """
 
     def __init__(self, policy: GapPolicy) -> None:
         self.policy = policy
         self._sequence: int | None = None
         self._time = 0.0
-        self._rate = np.zeros(3)
-        self._force = np.zeros(3)
+        self.rate = np.zeros(3)
+        self.force = np.zeros(3)
+
+    @property
+    def expected(self) -> int:
+        """Number of the sample that comes next; -1 before the first."""
+        return -1 if self._sequence is None else self._sequence + 1
+
+    def passed(self, sequence: int, time: float) -> None:
+        """The sample that came next needed no filling; `rate` and `force` are told already."""
+        self._sequence, self._time = sequence, time
 
     def fill(self, imu: ImuIncrements) -> tuple[ImuIncrements, list[Gap]]:
         """The batch with its gaps filled; the batch itself where there is none."""
@@ -88,7 +103,7 @@ class GapFiller:
         return result, gaps
 
     def _keep(self, imu: ImuIncrements, row: int) -> None:
-        _rates(imu.step, imu.dtheta, imu.dvel, row, self._rate, self._force)
+        _rates(imu.step, imu.dtheta, imu.dvel, row, self.rate, self.force)
 
     def _filled(self, imu: ImuIncrements, jumps: np.ndarray) -> tuple[ImuIncrements, list[Gap]]:
         parts: list[ImuIncrements] = []
@@ -125,8 +140,8 @@ class GapFiller:
         step = length / count
         after_rate, after_force = imu.dtheta[row] / imu.step[row], imu.dvel[row] / imu.step[row]
         weight = ((np.arange(count) + 0.5) / count)[:, None]
-        rate: FloatArray = self._rate * (1.0 - weight) + after_rate * weight
-        force: FloatArray = self._force * (1.0 - weight) + after_force * weight
+        rate: FloatArray = self.rate * (1.0 - weight) + after_rate * weight
+        force: FloatArray = self.force * (1.0 - weight) + after_force * weight
         mark = int(Validity.INTERPOLATED | (Validity.BRIDGED if bridged else Validity.GOOD))
         numbers = sequence + 1 + (np.arange(count) * max(missing, 1)) // count
         return ImuIncrements(

@@ -30,6 +30,7 @@ from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, IntArray, Validity
 from nav.kernel import kernel
 from nav.lever_arm import shift
+from nav.ordinary import take_one
 from nav.rotation import euler_from_quaternion
 from nav.solutions import Solutions, StateArray
 from nav.state import Health, Mode, Ratio
@@ -39,6 +40,7 @@ Severity = Literal["info", "notice", "warning", "error"]
 
 DISTRUST = Health.SILENT | Health.BRIDGED | Health.SENSOR
 """Health that makes the mode DEGRADED."""
+_SILENT = int(Health.SILENT)
 _FLAGS = int(Validity.SENSOR | Validity.SPARE)
 _LAT, _LON, _HEIGHT, _VEL, _Q = slice(0, 1), slice(1, 2), slice(2, 3), slice(3, 6), slice(6, 10)
 REST_WINDOW_S = 2.0
@@ -161,6 +163,8 @@ class Navigator:
         self._state = _solution(settings.lat, settings.lon, settings.height, np.zeros(3), np.zeros(4))
         self._arm = np.asarray(settings.lever_arm, float)
         self._has_arm = bool(self._arm.any())
+        self._plain = aiding is None and not settings.track_bias_at_rest and not self._has_arm
+        """Nothing but the core looks at a sample."""
         self._aligner = aligner(self._plan, self._state[:3])
         self._progress = 0.0
         self._events: list[Event] = []
@@ -270,6 +274,8 @@ class Navigator:
         HilError
             An increment is not finite.
         """
+        if len(imu) == 1 and self._take_one(imu):
+            return self._solutions.room(1)
         bad = imu.first_bad()
         if bad >= 0:
             raise HilError(f"increment {int(imu.sequence[bad])} is not a number: mend the driver or the file")
@@ -299,6 +305,20 @@ class Navigator:
             rows[rows["mode"] >= Mode.NAVIGATE] = there
         self._solutions.keep_last(n)  # what `silent` repeats
         return rows
+
+    def _take_one(self, imu: ImuIncrements) -> bool:
+        """Take an ordinary sample (:mod:`nav.ordinary`); False, and nothing has changed, when it is not one."""
+        core, filler, health = self._core, self._filler, int(self.health)
+        if not self._plain or not core.address or self.mode < Mode.NAVIGATE or health & _SILENT:
+            return False
+        expected, what = (filler.expected, self._flagged, _FLAGS), (int(self.mode), health)
+        sample = imu.time, imu.step, imu.dtheta, imu.dvel, imu.validity, imu.sequence
+        out = self._solutions.buffer, filler.rate, filler.force
+        if not take_one(core.address, expected, what, *sample, self.gyro_bias, *out):
+            return False
+        filler.passed(expected[0], float(imu.time[0]))
+        self._state[:] = core.solution
+        return True
 
     def _move(self, sign: float, w_ib_b: FloatArray | None = None) -> None:
         """Move the state from the navigated point to the sensor (`sign` 1) or back (-1)."""

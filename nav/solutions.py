@@ -65,6 +65,11 @@ class Solutions:
         """(1,) The last row that was kept; to be changed in place."""
         return self._rows[:1]
 
+    @property
+    def buffer(self) -> StateArray:
+        """(2 or more,) rows; the first is `last`, the next that of the first sample."""
+        return self._rows
+
     def room(self, n: int) -> StateArray:
         """(n,) rows to be filled; valid until there is more to fill."""
         if n + 1 > len(self._rows):

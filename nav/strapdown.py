@@ -112,17 +112,23 @@ class Strapdown:
         self._memory, self._state = self._core[kernels.MEMORY_PART], self._core[kernels.STATE_PART]
         self.solution = self._core[kernels.SOLUTION_PART][:10]
         self._azimuth = self._core[kernels.SOLUTION_PART][10:]
+        self._address = _Address(self._core)
         self.push: Callable[[float, float, float, float, float, float, float], int] = self._push_first
 
     def __getstate__(self) -> dict[str, Any]:
         """What copies and pickles are made of: all but the ways into the core."""
-        ways = "_memory", "_state", "solution", "_azimuth", "push", "_views"
+        ways = "_memory", "_state", "solution", "_azimuth", "_address", "push", "_views"
         return {name: value for name, value in self.__dict__.items() if name not in ways}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Go on with a core of one's own."""
         self.__dict__.update(deepcopy(state))
         self._look()
+
+    @property
+    def address(self) -> int:
+        """Of the core, for :func:`nav.step.push` in kernels; 0 while, or where, only `advance` serves."""
+        return 0 if self._lead is not None or self._stream is not None or self._blocks else self._address
 
     @property
     def azimuth(self) -> float:
@@ -383,7 +389,7 @@ class Strapdown:
         self.advance(np.array([step]), np.array([[x, y, z]]), np.array([[vx, vy, vz]]), np.zeros(3), *one)
         if self._lead is None and self._stream is None:
             # The compiled function itself: numba's dispatcher costs as much as the step.
-            self.push = MethodType(_push.compile(kernels.PUSH), _Address(self._core))
+            self.push = MethodType(_push.compile(kernels.PUSH), self._address)
         return kernels.DONE
 
     def _room(self, n: int) -> None:

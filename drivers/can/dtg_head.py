@@ -197,7 +197,7 @@ def _are_samples(
             data[k, i] = frames[k, 16 + i]
         for i in range(_SAID):
             said[k, i] = now[i]
-        stamp = 0
+        stamp = np.int64(0)
         for i in range(8):
             stamp |= np.int64(frames[k, i]) << (8 * i)
         stamps[k] = stamp

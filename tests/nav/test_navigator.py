@@ -1,6 +1,7 @@
 """The navigator's modes, and that nothing it says depends on how samples were batched."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -253,9 +254,29 @@ def test_batches_do_not_matter(seed, cuts, choice):
     assert split.health == whole.health
 
 
-def test_one_sample_at_a_time():
-    imu = eventful(3)
-    whole, single = Navigator(GYRO), Navigator(GYRO)
+@pytest.mark.parametrize(
+    ("attitude", "mechanization"),
+    [
+        ("two-sample", "geographic"),
+        ("high-order:6", "wander"),
+        ("high-order", "earth"),
+        ("two-sample", "inertial-source"),
+        ("poisson-rk4", "geographic"),
+    ],
+)
+def test_one_sample_at_a_time(attitude, mechanization):
+    imu, choice = eventful(3), replace(GYRO, attitude=attitude, mechanization=mechanization)
+    whole, single = Navigator(choice), Navigator(choice)
     expected = whole.process(imu).copy()
     got = np.concatenate([single.process(imu.rows(k, k + 1)).copy() for k in range(len(imu))])
     assert got.tobytes() == expected.tobytes()
+    assert single.events() == whole.events()
+    assert single.silent().tobytes() == whole.silent().tobytes(), "the row that is kept is the last one"
+
+
+def test_a_sample_alone_that_is_no_number_is_refused():
+    navigator = aligned()
+    bad = rest(0.01, first=250)
+    bad.dvel[0, 1] = np.nan
+    with pytest.raises(HilError, match="increment 250 is not a number"):
+        navigator.process(bad)
