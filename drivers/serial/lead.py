@@ -7,6 +7,8 @@ nothing (none, or many packets in one read at the start) leave it a gap.
 
 SETTLED_NS = 1_000_000_000
 """The fastest arrival is known when none was faster, by half a sample, for so long."""
+LEAST_NS = 5_000_000
+"""A smaller step is taken for a gap: some arrivals are faster than ever by so much."""
 DRIFT = 2000
 """What was the fastest fades by one part in so many of the time: either clock may drift."""
 
@@ -31,4 +33,5 @@ class Lead:
         """Whether the clock of a sample that seems to be `steps` periods on was set ahead."""
         if self._at is None or self._at - self._risen < SETTLED_NS:
             return False
-        return 2 * (time_ns - arrival_ns - self._most) > (steps - 1) * period_ns
+        ahead = time_ns - arrival_ns - self._most
+        return ahead > max((steps - 1) * period_ns // 2, LEAST_NS)

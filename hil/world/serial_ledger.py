@@ -6,6 +6,7 @@ are part of no packet is: right as long as no noise passes a check by chance.
 
 from dataclasses import dataclass
 
+from drivers.serial.lead import LEAST_NS
 from hil.wire_config import COUNTING
 from hil.world.ledger import Ledger
 
@@ -36,7 +37,7 @@ class SerialLedger(Ledger):
             self.restarts += 1
             self.samples -= 1  # it is set aside until the next one continues it
         else:
-            self.clock_steps += by_clock > 1 and 2 * jump > (by_clock - 1) * self.period_us
+            self.clock_steps += jump > max((by_clock - 1) * self.period_us // 2, LEAST_NS // 1000) and by_clock > 1
 
     def as_dict(self) -> dict[str, int]:
         """Name to count; `skipped_bytes` is in `head` of the summary."""

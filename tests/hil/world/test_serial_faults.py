@@ -1,5 +1,9 @@
 """Faults of a serial line: what the drivers of real boards count of them, packet by packet, and where time goes on."""
 
+import time
+from contextlib import closing
+from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -8,11 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers import emulator_names, make_driver
+from drivers.can.bus import open_port
+from drivers.can.frames import frames
 from drivers.serial.driver import SerialDriver
+from drivers.serial.port import SerialPort
 from hil.bridge import EVENTS, Loop, LoopOrder, Outlets
 from hil.scenario import Scenario
 from hil.wire_config import COUNTING, SERIAL
-from hil.world.head import SimulatedHead, faulty
+from hil.world.head import SimulatedHead, faulty, stream
 from nav.errors import HilError
 from nav.increments import FloatArray
 
@@ -36,8 +43,8 @@ def taken(chosen: Scenario, samples: int = SAMPLES) -> tuple[SerialDriver, dict[
     head, driver = SimulatedHead(chosen), make_driver(chosen.driver)
     assert head.wire is not None
     assert isinstance(driver, SerialDriver)
-    frames = np.concatenate([piece.copy() for _, piece in faulty(head, head.wire, samples)])
-    times = [driver.decode(frames[start : start + 50]).time.copy() for start in range(0, len(frames), 50)]
+    sent = np.concatenate([piece.copy() for _, piece in faulty(head, head.wire, samples)])
+    times = [driver.decode(sent[start : start + 50]).time.copy() for start in range(0, len(sent), 50)]
     return driver, head.wire.report(), np.concatenate(times)
 
 
@@ -170,3 +177,31 @@ def test_navigation_goes_on_by_the_gap_policy(board: str, wire: dict[str, Any], 
     realigned = mode is None and board not in COUNTING
     assert loop.result()["mode"] == (mode or "navigate")
     assert sum(b"aligned in" in text for text in told) == 1 + realigned, told
+
+
+@boards
+def test_the_same_on_a_real_port_that_is_pulled_out(board: str, tmp_path: Path) -> None:
+    """In real time on a pseudo-terminal: real arrivals tell the step, and what was lost with the port is counted."""
+    wire = (
+        {"kind": "drop", "at_s": 0.5, "for_s": 0.5, "share": 0.1},
+        {"kind": "clock-step", "at_s": 1.5, "step_s": 0.5},
+        {"kind": "unplugged", "at_s": 2.0, "for_s": 0.2},
+    )
+    head = SimulatedHead(scenario(board, *wire, bus=f"pty:{tmp_path / 'imu'}"))
+    driver, batch, samples = make_driver(board), frames(256), 3 * RATE_HZ + 100
+    with (
+        closing(open_port(f"pty:{tmp_path / 'imu'}")) as pty,
+        closing(SerialPort(f"serial:{tmp_path / 'imu'}:921600")) as port,
+    ):
+        sender = Thread(target=stream, args=(head, pty, samples), kwargs={"paced": True, "cancelled": lambda: False})
+        sender.start()
+        deadline = time.monotonic() + 20.0
+        while driver.counters.samples + driver.counters.lost < samples - unsaid(board) and time.monotonic() < deadline:
+            driver.decode(batch[: port.receive(batch, 0.05)])
+        sender.join()
+    assert head.wire is not None
+    report, counters = head.wire.report(), driver.counters
+    assert {name: counters.as_dict()[name] for name in report["expected"]} == report["expected"]
+    assert (counters.clock_steps, counters.restarts, port.failures) == (1, 0, 1)
+    assert counters.samples + counters.lost == samples - unsaid(board), "no sample is lost uncounted"
+    assert counters.lost >= report["lost"]["drop"] + report["lost"]["unplugged"]
