@@ -39,7 +39,7 @@ class Counters:
     frozen: int = 0
     """Samples whose counter stood still while their time went on; dropped, and in `lost` once the counter goes on."""
     clock_steps: int = 0
-    """Times the board's clock jumped while its counter went on; the time of the samples goes on with the counter."""
+    """Times the board's clock jumped while its samples went on, by their counter or their arrival; time goes on with them."""
 
     def as_list(self) -> list[int]:
         """The counts in the order of the fields."""

@@ -7,8 +7,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from nav.errors import HilError
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-CHECKED = ("crc-off",)
-"""Kinds that need a board whose frames carry a check."""
+SERIAL = ("microstrain-mip", "vectornav", "xsens-xbus")
+"""Emulated boards on a serial port."""
+COUNTING = ("xsens-xbus",)
+"""Those of them that count their samples."""
 
 
 class WireFault(BaseModel):
@@ -26,6 +28,7 @@ class WireFault(BaseModel):
         "counter-freeze",
         "crc-off",
         "silence",
+        "unplugged",
         "babble",
         "clock-step",
         "clock-drift",
@@ -42,7 +45,7 @@ class WireFault(BaseModel):
     drift_ppm: Annotated[float, Field(gt=-100_000, lt=100_000)] = 200.0
     """Of the device's clock: positive runs fast."""
     rate_hz: Annotated[float, Field(gt=0, le=100_000)] = 5000.0
-    """Frames of the babbling node a second."""
+    """Frames of the babbling node a second; on a serial line 8 bytes each."""
 
     @model_validator(mode="after")
     def _steps(self) -> Self:
@@ -60,8 +63,12 @@ class WireFault(BaseModel):
         return float("inf") if self.for_s is None else self.at_s + self.for_s
 
 
-def check_board(driver: str, faults: tuple[WireFault, ...]) -> None:
-    """Refuse (`HilError`) what the board of `driver` cannot have."""
+def check_board(driver: str, bus: str, faults: tuple[WireFault, ...]) -> None:
+    """Refuse (`HilError`) what the board of `driver` on `bus` cannot have."""
     for fault in faults:
-        if fault.kind in CHECKED and driver != "dtg-head":
-            raise HilError(f"wire.kind = {fault.kind!r}: the frames of {driver} carry no check that could be left out")
+        if fault.kind == "crc-off" and driver != "dtg-head":
+            raise HilError(f"wire.kind = 'crc-off': the frames of {driver} carry no check that can be left out")
+        if fault.kind == "counter-freeze" and driver in SERIAL and driver not in COUNTING:
+            raise HilError(f"wire.kind = 'counter-freeze': a {driver} counts no samples")
+        if fault.kind == "unplugged" and not bus.startswith("pty:"):
+            raise HilError("wire.kind = 'unplugged': only a port can be pulled out: hil imu SCENARIO --bus pty:PATH")

@@ -21,7 +21,7 @@ FRAMES = {
     "short": "frames have a wrong length",
     "version_errors": "frames are of another protocol version",
     "frozen": "the counter of the samples stands still while their time goes on",
-    "clock_steps": "the sensor's clock jumped and its counter went on: time goes on with the counter",
+    "clock_steps": "the sensor's clock jumped and its samples went on: time goes on with them",
 }
 BUS = {
     "bus_off": (

@@ -2,14 +2,16 @@
 
 ``unix:NAME`` (:mod:`drivers.can.unix_bus`), ``socketcan:vcan0`` (:mod:`drivers.can.socketcan`) and
 ``serial:/dev/ttyUSB0:921600`` (:mod:`drivers.serial.port`) are our own (``socketcan:can0?filter=120:7F0`` has the kernel keep
-other frames back), as is ``mavlink:LINK`` (:mod:`drivers.mavlink.port`); anything else is python-can: ``virtual:NAME``,
-``udp_multicast:239.74.163.2``, or ``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
+other frames back), as are ``pty:PATH``, a port that is made there (:mod:`drivers.serial.pty`), and ``mavlink:LINK``
+(:mod:`drivers.mavlink.port`); anything else is python-can: ``virtual:NAME``, ``udp_multicast:239.74.163.2``, or
+``INTERFACE:CHANNEL?bitrate=500000&fd=true``.
 """
 
 import contextlib
 import errno
 import socket
 import time
+from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import parse_qsl
 
@@ -71,6 +73,10 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
         from drivers.serial.port import SerialPort
 
         return SerialPort(url)
+    if interface == "pty":
+        from drivers.serial.pty import PtyPort
+
+        return PtyPort(Path(rest))
     if interface == "mavlink":
         from drivers.mavlink.port import MavlinkPort
 

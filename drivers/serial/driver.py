@@ -125,7 +125,7 @@ class SerialDriver:
         if not math.hypot(*reading.turn, *reading.push) < _LARGEST:  # nor is NaN
             self.counters.crc_errors += 1
             return
-        step_ns = self._timeline.place(reading.time_ns, reading.counter, reading.step_ns)
+        step_ns = self._timeline.place(reading.time_ns, reading.counter, reading.step_ns, arrival)
         if step_ns <= 0:
             return
         n = self._count

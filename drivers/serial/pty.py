@@ -1,10 +1,14 @@
-"""A pseudo-terminal as a `drivers.mavlink.link.Link`: another program opens it like a serial port."""
+"""A pseudo-terminal as a `drivers.mavlink.link.Link` or a bus: another program opens it like a serial port."""
 
 import os
+import select
 import termios
+import time
 import tty
 from pathlib import Path
 
+from drivers.can.frames import FrameArray
+from drivers.serial.chunks import chunk_bytes, fill_chunks, is_chunk
 from nav.errors import HilError
 
 _CHUNK = 2048
@@ -81,3 +85,48 @@ class PtyLink:
             os.close(fd)
         if self._path is not None and self._path.is_symlink():
             self._path.unlink()
+
+
+class PtyPort:
+    """The board's end of a serial line, ``pty:PATH``; satisfies `drivers.can.bus.Port`.
+
+    Parameters
+    ----------
+    path : Path
+        Where the other end is found, as ``serial:PATH:BAUD``.
+
+    Raises
+    ------
+    HilError
+        As `PtyLink`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._place, self.dropped = path, 0
+        self._link: PtyLink | None = PtyLink(path)
+
+    def plug(self, plugged: bool) -> None:
+        """Pull the line out or put it back."""
+        if not plugged:
+            self.close()
+        elif self._link is None:
+            self._link = PtyLink(self._place)
+
+    def receive(self, batch: FrameArray, timeout: float) -> int:
+        """See `drivers.can.bus.Port.receive`."""
+        if self._link is None or not select.select([self._link], [], [], timeout)[0]:
+            return 0
+        return fill_chunks(batch, self._link.receive(), time.time_ns())
+
+    def send(self, batch: FrameArray) -> None:
+        """Write the bytes of each chunk in `batch`; other frames, and what nobody reads, count as dropped."""
+        for k in range(len(batch)):
+            row = batch[k : k + 1]
+            if self._link is None or not is_chunk(row)[0] or not self._link.send(chunk_bytes(row)):
+                self.dropped += 1
+
+    def close(self) -> None:
+        """Give everything back."""
+        if self._link is not None:
+            self._link.close()
+        self._link = None

@@ -8,7 +8,7 @@ from drivers.serial import xbus
 from drivers.serial.chunks import to_chunks
 from drivers.serial.increments import from_integrals
 from drivers.serial.stream import ByteStream
-from nav.increments import ImuIncrements
+from nav.increments import ImuIncrements, IntArray
 
 _FORMS = {"float32": 0, "fp12.20": 1, "fp16.32": 2, "double": 3}
 
@@ -56,8 +56,17 @@ class XbusEmulator:
         self.outputs: dict[int, int] = {}
         """Output configuration as it was set: data identifier to rate, Hz."""
 
-    def packets(self, imu: ImuIncrements, status: int = 0x03, temperature_c: float = 25.0) -> list[bytes]:
-        """One MTData2 message for each sample; the increments are those of a board that does its own coning."""
+    def packets(
+        self,
+        imu: ImuIncrements,
+        status: int = 0x03,
+        temperature_c: float | None = 25.0,
+        counters: IntArray | None = None,
+    ) -> list[bytes]:
+        """One MTData2 message for each sample; the increments are those of a board that does its own coning.
+
+        `counters` (n,) are said in the place of its own; a temperature of None is left out.
+        """
         phi, u = from_integrals(imu.dtheta, imu.dvel, self._before)
         half = np.linalg.norm(phi, axis=1, keepdims=True) / 2.0
         sine = np.sinc(half / np.pi) / 2.0
@@ -66,13 +75,15 @@ class XbusEmulator:
         out = []
         for k in range(len(imu)):
             ticks = round(imu.time[k] * 1e9 / xbus.TICK_NS)
-            data = field(xbus.COUNTER, struct.pack(">H", self._counter & 0xFFFF))
+            counter = self._counter if counters is None else int(counters[k])
+            data = field(xbus.COUNTER, struct.pack(">H", counter & 0xFFFF))
             data += field(xbus.TIME_FINE, struct.pack(">I", ticks & 0xFFFFFFFF))
             if self._increments:
                 data += self._reals(xbus.DELTA_Q, delta_q[k]) + self._reals(xbus.DELTA_V, u[k] * [1, -1, -1])
             else:
                 data += self._reals(xbus.RATE, rate[k]) + self._reals(xbus.ACCELERATION, force[k])
-            data += self._reals(xbus.TEMPERATURE, np.array([temperature_c]))
+            if temperature_c is not None:
+                data += self._reals(xbus.TEMPERATURE, np.array([temperature_c]))
             data += field(xbus.STATUS, struct.pack(">I", status))
             out.append(xbus.message(xbus.MTDATA2, data))
             self._counter += 1

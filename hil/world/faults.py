@@ -3,10 +3,13 @@
 They are applied in this order, whatever theirs in the file, each within its time and with a random stream of its own:
 
 - in the device (`DeviceFaults`): the clock steps or drifts, the counter stands still;
-- ``drop``, ``bit-flip`` (one bit of the payload), ``crc-off`` (the check stays 0), ``silence`` (nothing goes out);
+- ``drop``, ``bit-flip`` (one bit of the payload), ``crc-off`` (the check stays 0), ``silence`` (nothing goes out), and
+  ``unplugged``: the same, and the port is gone;
 - ``duplicate``: a frame goes out again right behind itself, as CAN repeats one whose end the sender did not see acknowledged;
 - ``reorder``: a sample goes out behind the next one; ``delay`` and ``jitter`` hold frames up, and none overtakes another;
-- ``babble``: frames of another node with the identifier that wins every arbitration.
+- ``babble``: frames of another node with the identifier that wins every arbitration; on a serial line noise.
+
+On a serial line a frame is a packet.
 
 The result depends on the scenario alone: the same frames in the same order at any speed. What was done is counted, and what a
 bridge must count of it (:mod:`hil.world.ledger`).
@@ -22,15 +25,19 @@ from numpy.typing import NDArray
 
 from drivers.can.aiding import is_aiding
 from drivers.can.frames import FDF, FrameArray, frames
+from drivers.serial.chunks import CHUNK
 from hil.scenario import Scenario
-from hil.wire_config import WireFault
+from hil.wire_config import SERIAL, WireFault
 from hil.world.ledger import Ledger
+from hil.world.serial_ledger import SerialLedger
 from nav.increments import FloatArray, IntArray
 
 BABBLE_ID = 0
 """Wins every arbitration, and belongs to nobody here."""
 _STREAM = 5
 """What sets the random streams of the wire apart from others of the scenario's seed."""
+_CUT = ("samples", "lost", "skipped_bytes")
+"""What cannot be said where a port is pulled out: bytes in it are lost too, and it is opened again when somebody looks."""
 _SAMPLE, _SLOW, _AIDING, _FOREIGN = range(4)
 
 
@@ -106,8 +113,11 @@ class Wire:
         ]
         self.device = DeviceFaults(scenario.wire, period_us)
         self._step, self._parts = period_us * 1e-6, frames_per_sample
-        self._judged = scenario.driver == "dtg-head"
-        self._ledger = Ledger(frames_per_sample, period_us)
+        self._serial = scenario.driver in SERIAL
+        self._judged = self._serial or scenario.driver == "dtg-head"
+        self._ledger = (
+            SerialLedger.of(scenario.driver, period_us) if self._serial else Ledger(frames_per_sample, period_us)
+        )
         self._injected, self._lost_by = Counter[str](), Counter[str]()
         self._fates: dict[int, str] = {}
         """What has become of the lost samples of the chunk that goes out."""
@@ -128,7 +138,7 @@ class Wire:
         self._fates = dict.fromkeys(frozen, "counter-freeze")
         self._injected["counter-freeze"] += len(frozen)
         now = [one for one in self._faults if one[0].at_s < end * self._step and one[0].end_s > first * self._step]
-        for kind in ("drop", "bit-flip", "crc-off", "silence"):
+        for kind in ("drop", "bit-flip", "crc-off", "silence", "unplugged"):
             for fault, rng in now:
                 traffic = self._lose(fault, rng, traffic) if fault.kind == kind else traffic
         for kind in ("duplicate", "reorder", "delay", "jitter", "babble"):
@@ -146,12 +156,22 @@ class Wire:
         if held is not None:
             yield from self._out(held)
 
+    def is_plugged(self, time_s: float) -> bool:
+        """Whether the port is there."""
+        return not any(fault.kind == "unplugged" and fault.holds(time_s) for fault, _ in self._faults)
+
+    def plug_times(self) -> list[float]:
+        """When the port goes away or comes back, in order."""
+        return sorted({edge for one, _ in self._faults if one.kind == "unplugged" for edge in (one.at_s, one.end_s)})
+
     def report(self) -> dict[str, object]:
         """What was done, by kind: frames (samples for reorder and counter-freeze); samples lost by it; what must be counted."""
         lost = self._lost_by + Counter(kind for sample, kind in self._fates.items() if sample < self.samples)
+        lost["clock-step"] += self._ledger.restarts
         result: dict[str, object] = {"samples": self.samples, "injected": dict(+self._injected), "lost": dict(+lost)}
         if self._judged:
-            result["expected"] = self._ledger.as_dict()
+            expected, cut = self._ledger.as_dict(), bool(self.plug_times())
+            result["expected"] = {name: count for name, count in expected.items() if not (cut and name in _CUT)}
         return result
 
     def _traffic(self, first: int, slow: FrameArray, batch: FrameArray) -> _Traffic:
@@ -197,7 +217,7 @@ class Wire:
         if self._judged or fault.kind != "bit-flip":  # a board without a check does not see the damage
             for sample in np.unique(traffic.sample[hit & (traffic.kind == _SAMPLE)]).tolist():
                 self._fates.setdefault(sample, fault.kind)
-        if fault.kind in {"drop", "silence"}:
+        if fault.kind in {"drop", "silence", "unplugged"}:
             return traffic.chosen(~hit)
         traffic.intact[hit] = False
         return traffic
@@ -221,20 +241,22 @@ class Wire:
                     self._injected["reorder"] += 1
             return traffic
         if fault.kind == "babble":
-            return self._babbled(fault, traffic, slots)
+            return self._babbled(fault, rng, traffic, slots)
         held = np.zeros(end - first)
         held[slots - first] = fault.delay_s * (rng.random(len(slots)) if fault.kind == "jitter" else 1.0)
         traffic.due += held[traffic.sample - first]
         self._injected[fault.kind] += int(hit.sum())
         return traffic
 
-    def _babbled(self, fault: WireFault, traffic: _Traffic, slots: IntArray) -> _Traffic:
+    def _babbled(self, fault: WireFault, rng: np.random.Generator, traffic: _Traffic, slots: IntArray) -> _Traffic:
         since = np.maximum((slots[:, None] + np.array([0, 1])) * self._step - fault.at_s, 0.0)
         counts = np.diff(np.floor(since * fault.rate_hz + 1e-6).astype(np.int64), axis=1)[:, 0]
         sample = np.repeat(slots, counts)
         n = len(sample)
         batch = frames(n)
-        batch["can_id"], batch["length"] = BABBLE_ID, 8
+        batch["can_id"], batch["length"] = CHUNK if self._serial else BABBLE_ID, 8
+        if self._serial:
+            batch["data"][:, :8] = rng.integers(0, 256, (n, 8))
         if len(traffic.frames) and n and traffic.frames["time_ns"].any():  # frames that have their time already
             batch["time_ns"] = np.rint((sample + 1) * self._step * 1e9).astype(np.int64)
         self._injected["babble"] += n
@@ -254,20 +276,23 @@ class Wire:
         stamped = traffic.frames["time_ns"] > 0
         late_ns = np.rint((due - (traffic.sample + 1) * self._step) * 1e9).astype(np.int64)
         traffic.frames["time_ns"][stamped] += late_ns[stamped]
-        columns = (traffic.kind, traffic.sample, traffic.part, traffic.intact, traffic.frozen, traffic.clock_us)
+        length = traffic.frames["length"]
+        columns = (traffic.kind, traffic.sample, traffic.part, traffic.intact, traffic.frozen, traffic.clock_us, length)
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
         for start, end in pairwise([0, *(np.flatnonzero(np.diff(due)) + 1).tolist(), len(due)]):
             yield float(due[start]), traffic.frames[start:end]
             for row in rows[start:end]:
                 self._enter(*row)
 
-    def _enter(self, kind: int, sample: int, part: int, intact: bool, frozen: bool, clock_us: int) -> None:
+    def _enter(self, kind: int, sample: int, part: int, intact: bool, frozen: bool, clock_us: int, length: int) -> None:
         ledger = self._ledger
         self.samples = max(self.samples, sample + 1)
         ledger.frames += 1
         if kind == _FOREIGN:
             ledger.foreign += 1
+            ledger.skipped_bytes += length
         elif not intact:
             ledger.crc_errors += kind != _AIDING
+            ledger.skipped_bytes += length * (kind != _AIDING)
         elif kind == _SAMPLE:
             ledger.add_part(sample, part, clock_us, frozen=frozen)

@@ -10,6 +10,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -19,6 +20,7 @@ from drivers.can.aiding import AidingEncoder, is_aiding, merge
 from drivers.can.bus import Port, open_port
 from drivers.can.dtg_head_emulator import SIMULATED, HeadEncoder
 from drivers.can.frames import FrameArray, frames
+from drivers.serial.pty import PtyPort
 from hil.control import Control
 from hil.pacing import Pacer
 from hil.scenario import Scenario
@@ -58,7 +60,7 @@ class SimulatedHead:
             hardware=SIMULATED,
             rotor_hz=head.rotor.spin_hz,
         )
-        check_board(scenario.driver, scenario.wire)
+        check_board(scenario.driver, scenario.bus, scenario.wire)
         self.wire = Wire(scenario, self.period_us, self.frames_per_sample) if scenario.wire else None
         self.injection: Injection | None = None
         """Faults that it is told to have while it runs."""
@@ -130,6 +132,8 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
         for due_s, piece in faulty(head, head.wire, samples):
             if cancelled() or (paced and not pacer.wait(due_s, cancelled)):
                 break
+            if isinstance(port, PtyPort) and not len(piece):
+                port.plug(head.wire.is_plugged(due_s))
             port.send(piece if head.injection is None else head.injection.sent(head.wire.samples, piece))
         return head.wire.samples
     k = head.frames_per_sample
@@ -153,9 +157,16 @@ def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool,
 
 
 def faulty(head: SimulatedHead, wire: Wire, samples: int | None) -> Iterator[tuple[float, FrameArray]]:
-    """(when they are due, s; frames) of the head as its faulty wire hands them on."""
+    """(when they are due, s; frames) of the head as its faulty wire hands them on.
+
+    None at all at the start of each chunk, so that a silent head keeps time, and where the port goes away or comes back.
+    """
+    edges, nothing = wire.plug_times(), frames(0)
     for first, slow, batch in head.chunks(samples):
-        yield from wire.take(first, slow, batch)
+        for due, piece in chain([(first * head.step, nothing)], wire.take(first, slow, batch)):
+            while edges and edges[0] < due:
+                yield edges.pop(0), nothing
+            yield due, piece
     yield from wire.finish()
 
 

@@ -24,6 +24,8 @@ class Ledger:
     foreign: int = 0
     frozen: int = 0
     clock_steps: int = 0
+    restarts: int = 0
+    skipped_bytes: int = 0
     _first: int = -1
     _highest: int = -1
     _clock_us: int = 0

@@ -3,14 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from rows import COUNTERS, note, recorded
+from rows import each_fault, note, recorded, said
 
 from drivers.can.dtg_head import DtgHead
-from drivers.can.frames import FrameArray
-from hil.pytest_plugin import Bridge, StartBridge
-from nav.state import NAV_STATE, Mode
+from hil.pytest_plugin import StartBridge
 
 RATE_HZ, FIRST_S, EVERY_S = 200, 2.0, 2.0
 FAULTS: dict[str, dict[str, Any]] = {
@@ -42,7 +39,6 @@ SAYS = {
     "clock-drift": "the head's clock runs at `drift_ppm`",
     "silence": "nothing comes",
 }
-UNITS = {"delay_s": " s", "step_s": " s", "drift_ppm": " ppm"}
 FLIGHT = """
 name = "reliability"
 [motion]
@@ -71,40 +67,11 @@ def scenario(folder: Path) -> Path:
     return file
 
 
-def solutions(bridge: Bridge) -> Any:
-    """All solutions of the run, the filled ones too."""
-    ring = bridge.session.outlets.states
-    rows = np.zeros(ring.capacity, NAV_STATE)
-    copied, first = ring.pull(rows, 0)
-    assert first == 0, "none was overwritten"
-    return rows[:copied]
-
-
-def counted_until(frames: FrameArray, times: list[float]) -> list[dict[str, int]]:
-    """What the driver has counted before the first of `frames`, and by the device times `times`."""
-    driver = DtgHead()
-    marks = [driver.counters.as_dict()]
-    for k in range(len(frames)):
-        raw = driver.decode(frames[k : k + 1])
-        if len(raw) and len(marks) <= len(times) and raw.time[0] > times[len(marks) - 1]:
-            marks.append(driver.counters.as_dict())
-    marks += [driver.counters.as_dict()] * (len(times) + 1 - len(marks))
-    return [{name: mark[name] for name in COUNTERS if name in mark} for mark in marks]
-
-
-def injected(kind: str) -> str:
-    keys = {key: value for key, value in FAULTS[kind].items() if key != "for_s"}
-    said = SAYS[kind]
-    for key, value in keys.items():
-        said = said.replace(f"`{key}`", f"{value:g}{UNITS.get(key, '')}" if "_" in key else f"{100 * value:g} %")
-    return f"{said}, for {FAULTS[kind]['for_s']:g} s"
-
-
 def test_every_fault_of_the_wire_is_counted_told_and_over(hil_bridge: StartBridge, tmp_path: Path) -> None:
     path, end_s = tmp_path / "run.dhil", FIRST_S + EVERY_S * len(FAULTS)
     bridge = hil_bridge(scenario(tmp_path), record=path, duration_s=end_s, mavlink={"links": ()})
     summary = bridge.wait_end(120)
-    wire, rows, events, (frames, _) = summary["wire"], solutions(bridge), bridge.events(), recorded(path)
+    wire, (frames, _) = summary["wire"], recorded(path)
 
     assert {name: summary[name] for name in wire["expected"]} == wire["expected"], "counted to the frame"
     received = summary["samples"] + summary["late"] + sum(wire["lost"].values())
@@ -114,21 +81,19 @@ def test_every_fault_of_the_wire_is_counted_told_and_over(hil_bridge: StartBridg
     assert len(frames) == summary["frames"] == summary["recorder"]["frames"] - summary["silences"]
     assert summary["recorder"]["lost"] == 0
 
-    clean = rows["time"] < FIRST_S
-    marks = counted_until(frames, [begins(kind) + EVERY_S - 0.1 for kind in FAULTS])
-    offset = np.min(rows["solution_ns"][clean] * 1e-9 - rows["time"][clean])
-    for number, kind in enumerate(FAULTS):
-        start, end = begins(kind), begins(kind) + FAULTS[kind]["for_s"]
-        after = np.flatnonzero(rows["time"] > end + 1e-6)[0]
-        back_s = rows["solution_ns"][after] * 1e-9 - rows["time"][after] - offset
-        mode = Mode(int(rows["mode"][np.flatnonzero(rows["time"] < start + EVERY_S - 0.1)[-1]])).name
-        assert mode == ("DEGRADED" if kind == "silence" else "NAVIGATE"), kind
-        told = [text for moment, _, text in events if start - 0.1 <= moment < start + EVERY_S - 0.1]
-        moved = {name: marks[number + 1][name] - marks[number][name] for name in marks[0]}
-        moved["silences"] = told.count("no samples: the sensor is silent")
-        assert bool(told) == any(moved.values()), (kind, told)
-        back = f"{max(back_s, 0.0):.3f}, {mode}"
-        note(number, f"`{kind}`", injected(kind), moved, told, back, "0")
+    windows = {kind: (begins(kind), begins(kind) + fault["for_s"]) for kind, fault in FAULTS.items()}
+    for number, found in enumerate(each_fault(bridge, frames, DtgHead(), windows, EVERY_S - 0.1)):
+        assert found.mode == ("DEGRADED" if found.kind == "silence" else "NAVIGATE"), found.kind
+        assert bool(found.told) == any(found.moved.values()), found
+        note(
+            number,
+            f"`{found.kind}`",
+            said(SAYS, found.kind, FAULTS[found.kind]),
+            found.moved,
+            found.told,
+            found.back,
+            "0",
+        )
 
 
 @pytest.mark.parametrize("kind", ["drop", "bit-flip"])

@@ -1,23 +1,92 @@
-"""A board on a serial port that is pulled out and put back, and bytes that are damaged on the line."""
+"""Every fault of a serial line in one flight; a port that is pulled out and put back, and bytes that are damaged on the line."""
 
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from rows import counts, note, recorded
+from rows import counts, each_fault, note, recorded, said
 
 sys.path.append(str(Path(__file__).parents[1] / "drivers" / "serial"))
 from pty_board import BOARDS, Plugged, moving
 
+from drivers import emulator_names, make_driver
+from drivers.can.bus import open_port
 from hil.pytest_plugin import Bridge, StartBridge
+from hil.scenario import Scenario
+from hil.world.head import SimulatedHead, stream
 
 STEP_S = 0.01
 SCENARIO = {
     "driver": "xsens-xbus",
     "navigation": {"alignment": "level", "align_s": 0.5, "start": {"heading_deg": 30.0}},
 }
+
+FIRST_S, EVERY_S, BEHIND_S = 2.0, 2.0, 1.5
+FAULTS: dict[str, dict[str, Any]] = {
+    "drop": {"share": 0.05, "for_s": 0.5},
+    "duplicate": {"share": 0.05, "for_s": 0.5},
+    "reorder": {"share": 0.05, "for_s": 0.5},
+    "delay": {"delay_s": 0.3, "for_s": 0.5},
+    "jitter": {"delay_s": 0.02, "for_s": 0.5},
+    "bit-flip": {"share": 0.05, "for_s": 0.5},
+    "babble": {"rate_hz": 100, "for_s": 0.5},
+    "clock-step": {"step_s": 0.5},
+    "clock-drift": {"drift_ppm": 200, "for_s": 0.5},
+    "unplugged": {"for_s": 0.5},
+}
+"""What is bridged leaves the navigator DEGRADED until it aligns anew: the last one."""
+SAYS = {
+    "drop": "`share` of the packets do not arrive",
+    "duplicate": "`share` of the packets come twice",
+    "reorder": "`share` of the packets come behind the next one",
+    "delay": "all packets come `delay_s` later",
+    "jitter": "all packets come up to `delay_s` later",
+    "bit-flip": "one bit of `share` of the packets",
+    "babble": "8 bytes of noise, `rate_hz` times a second",
+    "clock-step": "the board's clock is set ahead by `step_s`",
+    "clock-drift": "the board's clock runs at `drift_ppm`",
+    "unplugged": "the port goes away",
+}
+
+
+@pytest.mark.skipif("vectornav" not in emulator_names(), reason="installed before: pip install -e .")
+def test_every_fault_of_a_serial_line_is_counted_told_and_over(hil_bridge: StartBridge, tmp_path: Path) -> None:
+    path, place, end_s = tmp_path / "run.dhil", tmp_path / "ttyIMU", FIRST_S + EVERY_S * len(FAULTS)
+    begins = {kind: FIRST_S + EVERY_S * number for number, kind in enumerate(FAULTS)}
+    flight = Scenario.model_validate(
+        {
+            "name": "serial",
+            "driver": "vectornav",
+            "bus": f"pty:{place}",
+            "head": {"rate_hz": 200},
+            "navigation": SCENARIO["navigation"],
+            "wire": [{"kind": kind, "at_s": begins[kind], **fault} for kind, fault in FAULTS.items()],
+        }
+    )
+    head, port, samples = SimulatedHead(flight), open_port(flight.bus, listen=False), round(end_s * 200)
+    url, links = f"serial:{place}:921600", {"links": ()}
+    bridge = hil_bridge(flight, simulate_head=False, bus=url, record=path, mavlink=links, wire=())
+    assert stream(head, port, samples, paced=True, cancelled=lambda: False) == samples
+    wait_for(bridge, ("samples", "late", "lost"), samples)
+    port.close()
+    summary = bridge.stop()
+    assert head.wire is not None
+    wire, (frames, _) = head.wire.report(), recorded(path)
+    assert {name: summary[name] for name in wire["expected"]} == wire["expected"], "counted to the packet"
+    assert summary["samples"] + summary["late"] + summary["lost"] == wire["samples"]
+    assert set(wire["injected"]) | {"clock-drift", "clock-step"} == set(FAULTS)
+    windows = {kind: (begins[kind], begins[kind] + fault.get("for_s", 0.0)) for kind, fault in FAULTS.items()}
+    for number, found in enumerate(each_fault(bridge, frames, make_driver("vectornav"), windows, BEHIND_S)):
+        assert found.mode == ("DEGRADED" if found.kind == "unplugged" else "NAVIGATE"), found
+        assert bool(found.told) == any(found.moved.values()), found
+        does, told = (
+            said(SAYS, found.kind, FAULTS[found.kind]),
+            [text.replace(str(tmp_path), "/dev") for text in found.told],
+        )
+        note(12 + number, f"`{found.kind}`, serial", does, found.moved, told, found.back, "0")
 
 
 def packets(n: int) -> list[bytes]:
@@ -34,9 +103,9 @@ def feed(board: Plugged, packets: list[bytes]) -> None:
         time.sleep(STEP_S)
 
 
-def wait_for_samples(bridge: Bridge, count: int) -> None:
+def wait_for(bridge: Bridge, names: tuple[str, ...], count: int) -> None:
     deadline = time.monotonic() + 20.0
-    while bridge.summary()["samples"] < count:
+    while sum(bridge.summary()[name] for name in names) < count:
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
@@ -60,7 +129,7 @@ def test_a_port_pulled_out_and_put_back(started: Bridge, tmp_path: Path) -> None
     with Plugged(None, tmp_path / "ttyIMU") as board:
         time.sleep(1.2)  # the mute one was pulled out: the port is opened anew
         feed(board, sent[:200])
-        wait_for_samples(started, 199)
+        wait_for(started, ("samples",), 199)
     time.sleep(0.3)
     feed_later = sent[250:]
     with Plugged(None, tmp_path / "ttyIMU") as board:
@@ -70,7 +139,7 @@ def test_a_port_pulled_out_and_put_back(started: Bridge, tmp_path: Path) -> None
         back_s = time.monotonic() - plugged
         before = started.summary()["samples"]
         feed(board, feed_later)
-        wait_for_samples(started, before + len(feed_later) - 1)
+        wait_for(started, ("samples",), before + len(feed_later) - 1)
     summary = started.stop()
     bytes_in = int(recorded(tmp_path / "run.dhil")[0]["length"].sum())
     assert summary["restarts"] == 0
@@ -103,7 +172,7 @@ def test_damaged_bytes_cost_the_packets_that_they_hit(started: Bridge, tmp_path:
     with Plugged(None, tmp_path / "ttyIMU") as board:
         time.sleep(1.2)
         feed(board, sent)
-        wait_for_samples(started, len(sent) - 1 - len(hit))
+        wait_for(started, ("samples",), len(sent) - 1 - len(hit))
     summary = started.stop()
     assert summary["lost"] == len(hit)
     assert summary["samples"] == len(sent) - 1 - len(hit), "the first one sets the clock"

@@ -181,8 +181,7 @@ def test_a_board_that_starts_anew(name: str) -> None:
     before, after = moving(50, start_s=100.0), moving(50, start_s=0.0)
     data = b"".join(emulator.packets(before)) + b"".join(BOARDS[name][1]().packets(after))
     got = decoded(driver, to_chunks(data))
-    assert driver.counters.restarts == 1
-    assert driver.counters.lost == driver.counters.crc_errors == 0
+    assert (driver.counters.restarts, driver.counters.lost, driver.counters.crc_errors) == (1, 1, 0)
     later = got.rows(50 - SILENT[name], len(got))
     assert len(later) == 49  # the first one was set aside until the second confirmed it
     assert later.sequence[0] - got.sequence[49 - SILENT[name]] == 2

@@ -1,5 +1,9 @@
 """Order of samples by clock and counter, where a board lies."""
 
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
 from drivers import Counters
 from drivers.serial.timeline import LONGEST_NS, Timeline
 
@@ -10,15 +14,14 @@ def placed(timeline: Timeline, times: list[int]) -> list[int]:
     return [timeline.place(time, 0, PERIOD_NS) for time in times]
 
 
-def test_a_leap_of_the_clock_is_a_new_start_and_loses_nothing() -> None:
+def test_a_leap_of_the_clock_is_a_new_start_and_loses_its_first_sample() -> None:
     """Of 2^63 ns at a time, samples are not counted as lost: their number would leave 64 bits."""
     counters = Counters()
     timeline = Timeline(counters, 1 << 64, 0)
     leaps = [k << 62 for k in range(4)]
     for base in leaps * 3:
         placed(timeline, [base, base + PERIOD_NS])
-    assert counters.lost == 0
-    assert counters.restarts == 3 * len(leaps) - 1
+    assert counters.lost == counters.restarts == 3 * len(leaps) - 1
     assert timeline.sequence < 100
 
 
@@ -28,3 +31,35 @@ def test_a_long_gap_is_counted() -> None:
     placed(timeline, [0, PERIOD_NS, PERIOD_NS + LONGEST_NS])
     assert counters.lost == LONGEST_NS // PERIOD_NS - 1
     assert counters.restarts == 0
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    rate_hz=st.sampled_from([50, 200, 1000]),
+    drift_ppm=st.floats(-200.0, 200.0),
+    step_s=st.sampled_from([0.0, 0.02, 0.7, 100.0]),
+)
+def test_arrivals_tell_a_clock_that_was_set_from_gaps(seed: int, rate_hz: int, drift_ppm: float, step_s: float) -> None:
+    """A board without a counter, a host that stalls, adapters that hold bytes up, clocks that drift: every gap is one."""
+    rng, n = np.random.default_rng(seed), 6 * rate_hz
+    true_s = np.arange(1, n + 1) / rate_hz
+    latency_s = 0.0005 + rng.exponential(0.0005, n)
+    for start in rng.uniform(1.5, 5.2, 3):  # nothing is read for a while, then all at once
+        stalled = (true_s > start) & (true_s < start + rng.uniform(0.01, 0.5))
+        latency_s[stalled] += true_s[stalled].max(initial=0.0) - true_s[stalled]
+    arrivals = np.maximum.accumulate(np.rint(1e9 * (true_s + latency_s)).astype(np.int64))
+    there = np.ones(n, bool)
+    for start in rng.uniform(1.5, 5.0, 4):
+        there[(true_s > start) & (true_s < start + rng.choice([1.5 / rate_hz, 0.05, 0.6]))] = False
+    there[-1] = True
+    device_s = true_s * (1.0 + 1e-6 * drift_ppm)
+    stepped = 5.8  # no gap and no stall is there
+    there[np.abs(true_s - stepped) < 2.0 / rate_hz] = True
+    device_s[true_s > stepped] += step_s
+    counters = Counters()
+    timeline = Timeline(counters, 1 << 64, 0)
+    for time_s, arrival in zip(device_s[there], arrivals[there], strict=True):
+        timeline.place(round(1e9 * time_s), 0, 10**9 // rate_hz, int(arrival))
+    assert counters.clock_steps == (step_s > 0.0)
+    assert counters.lost == n - there.sum()
+    assert counters.restarts == counters.crc_errors == 0

@@ -16,7 +16,8 @@ from hil.world.head import SimulatedHead, faulty, stream
 from nav.errors import HilError
 
 RATE_HZ, SAMPLES = 200, 600
-KINDS = get_args(WireFault.model_fields["kind"].annotation)
+KINDS = tuple(kind for kind in get_args(WireFault.model_fields["kind"].annotation) if kind != "unplugged")
+"""On a CAN bus."""
 LOSSES = {"drop", "bit-flip", "crc-off", "silence", "counter-freeze"}
 
 
@@ -30,7 +31,7 @@ def sent(chosen: Scenario) -> tuple[list[tuple[float, FrameArray]], dict[str, An
     """(when due, frames) of all that goes out, and the wire's report."""
     head = SimulatedHead(chosen)
     assert head.wire is not None
-    pieces = [(due, piece.copy()) for due, piece in faulty(head, head.wire, SAMPLES)]
+    pieces = [(due, piece.copy()) for due, piece in faulty(head, head.wire, SAMPLES) if len(piece)]
     return pieces, head.wire.report()
 
 
@@ -195,3 +196,5 @@ def test_what_cannot_be_is_refused() -> None:
         parse('[[wire]]\nkind = "clock-step"\nat_s = 1\nstep_s = 0', "x.toml")
     with pytest.raises(HilError, match="the frames of sbg carry no check"):
         SimulatedHead(scenario({"kind": "crc-off", "at_s": 1.0}, driver="sbg"))
+    with pytest.raises(HilError, match=r"only a port can be pulled out: hil imu SCENARIO --bus pty:PATH"):
+        SimulatedHead(scenario({"kind": "unplugged", "at_s": 1.0}))
