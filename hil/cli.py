@@ -99,6 +99,7 @@ def run(
 ) -> None:
     """Run the bridge: IMU in, navigation, MAVLink out. Without a bus it brings its own simulated head."""
     from hil.bridge import LoopOrder
+    from hil.cli_wires import look_before
     from hil.scenario import load
     from hil.session import simulated_head
 
@@ -115,16 +116,8 @@ def run(
         )
     if chosen.receiver and not _paced(speed):
         raise HilError("--speed max has no time in which a receiver could speak: leave it or the receivers out")
-    for receiver in chosen.receiver:
-        from drivers.serial.probe import check_receiver
-
-        if warning := check_receiver(receiver.port):
-            _say(warning)
-    if chosen.bus.startswith("serial:"):
-        from drivers.serial.probe import check_port
-
-        if warning := check_port(chosen.bus, chosen.driver):
-            _say(warning)
+    for warning in look_before(chosen):
+        _say(warning)
     order = LoopOrder(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
@@ -147,12 +140,14 @@ def imu(
     as_json: Json = False,
 ) -> None:
     """Run the simulated sensor head alone, for a bridge in another process or on another machine."""
+    from drivers.can.bus import check_url
     from hil.realtime import claim
     from hil.scenario import load
     from hil.world.head import SimulatedHead, feed
 
     chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
     chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
+    check_url(chosen.bus)
     stop = StopSignal()
     head = SimulatedHead(chosen)
     for lack in claim().lacking if realtime else ():
