@@ -193,7 +193,7 @@ class Session:
             shared = outlets.stats, outlets.fixes, self.links
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
-        self.feeds.launch(launch, outlets.states, 1)
+        self.feeds.launch(launch, outlets.states, 1, outlets.control)
         for k, (name, config) in enumerate(self._receivers.items()):
             launch(name, run_receiver, config, k, outlets.stats, outlets.aiding[1 + k], outlets.control)
 
@@ -353,11 +353,9 @@ class Session:
         stopped = self.outlets.control.beat_age_s(reader) > STOPPED_S
         if stopped and reader not in self._stopped:
             self._stopped.add(reader)
-            self._note(
-                f"the {reader} process does not answer: it is stopped or starved, and nothing waits for it",
-                "error",
-                problem=True,
-            )
+            waits = "nothing" if self.order.paced or reader == "publisher" else "simulated time"
+            text = f"the {reader} process does not answer: it is stopped or starved, and {waits} waits for it"
+            self._note(text, "error", problem=True)
         elif not stopped and reader in self._stopped:
             self._stopped.discard(reader)
             self._note(f"the {reader} process answers again", "notice")

@@ -100,6 +100,29 @@ def test_the_death_of_a_feed_is_said_and_the_run_goes_on(hil_bridge: StartBridge
     assert summary["samples"] == 12000
 
 
+def test_a_stopped_feed_holds_simulated_time_and_it_is_said(hil_bridge: StartBridge) -> None:
+    """A feed that is stopped cannot give its autopilot up: the user has to know what the run waits for."""
+    bridge = hil_bridge(navigation=TRUTH, motion=MOVING, duration_s=12, paced=False, mavlink={"links": ()}, feed=[JSON])
+    sitl = Sitl(port(bridge.session.feed_places()[0]))
+    sitl.socket.settimeout(30.0)
+    sitl.frame()
+    process = bridge.session._parts["feed 0"].process
+    assert process.pid
+    os.kill(process.pid, signal.SIGSTOP)
+    deadline = time.monotonic() + 30.0
+    while not bridge.session.problems and time.monotonic() < deadline:
+        assert bridge.session.running
+        time.sleep(0.05)
+    (said,) = bridge.session.problems
+    assert said == "the feed 0 process does not answer: it is stopped or starved, and simulated time waits for it"
+    waiting = bridge.session.outlets.stats["samples"]
+    os.kill(process.pid, signal.SIGCONT)
+    sitl.frame()
+    os.kill(process.pid, signal.SIGKILL)  # nobody is waited for any more
+    summary = bridge.wait_end(60)
+    assert waiting < summary["samples"] == 12000
+
+
 def scaled(grade: str, rate_hz: float, rng: np.random.Generator) -> tuple[float, float]:
     """Deviation of mean rate (deg/s) and force (mg) over a period, of white noise that is drawn."""
     fine_s, count = 1e-4, round(1e4 / rate_hz)
