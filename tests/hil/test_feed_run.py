@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from autopilots import ArduPilotAhrs, Px4, Sitl, on_terminal
 from commands import called
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hil.feed.common import ACTUATORS
@@ -155,6 +155,7 @@ def test_what_the_filter_is_told_of_the_sensor_counts() -> None:
     st.sampled_from([0.0, 0.004, 0.02]),
     st.booleans(),
 )
+@example([1, 1, 1, 2], 0.004, True)
 def test_a_tap_gives_every_solution_once(batches: list[int], span_s: float, restart: bool) -> None:
     """However they come, and where the sensor's clock begins anew: all of them, in times that rise, spans as long as asked."""
     ring, number = Ring(NAV_STATE, 1024, 0), 0
