@@ -33,11 +33,11 @@ def with_mavlink(scenario: Scenario, key: Path | None, tlog: Path | None) -> Sce
 
 
 def open_doors(scenario: Scenario) -> list[str]:
-    """A line for each link that other machines can reach."""
-    lines = []
-    for link in scenario.mavlink.links:
-        url = (link if isinstance(link, str) else link.url).partition("?")[0]
-        if listens_beyond(url):
-            how = "signed messages alone are taken" if scenario.mavlink.signing_key else "nothing is signed"
-            lines.append(f"MAVLink on {url} can be reached from other machines; {how}")
-    return lines
+    """A line for each link and each feed that other machines can reach."""
+    how = "signed messages alone are taken" if scenario.mavlink.signing_key else "nothing is signed"
+    urls = ((link if isinstance(link, str) else link.url).partition("?")[0] for link in scenario.mavlink.links)
+    doors = [("MAVLink", url, how) for url in urls]
+    doors += [(f"feed {feed.kind}", feed.listens, "nothing is signed") for feed in scenario.feed]
+    return [
+        f"{what} on {url} can be reached from other machines; {how}" for what, url, how in doors if listens_beyond(url)
+    ]

@@ -1,5 +1,6 @@
 """Feeds in a whole run: simulated time waits for the autopilot, real time does not, and the user is told what is rounded away."""
 
+import ipaddress
 import os
 import signal
 import time
@@ -210,6 +211,26 @@ def test_a_wrong_feed_is_refused_with_what_was_expected(feed: dict[str, Any], to
     with pytest.raises(HilError, match=r"feed\.0") as refused:
         load(None).with_changes(feed=[feed])
     assert told in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("host", "beyond"),
+    [("0.0.0.0", ["ardupilot-json on udpin", "px4 on tcpin", "vectornav on tcpin"]), ("127.0.0.2", [])],
+)
+def test_feeds_that_other_machines_can_reach_are_said(host: str, beyond: list[str]) -> None:
+    """As of MAVLink links: before the run, and in the same words."""
+    feeds = (f"ardupilot-json:{host}:0", f"px4:{host}:0", f"vectornav:tcp:{host}:0", "vectornav:pty")
+    options = [part for feed in feeds for part in ("--feed", feed)]
+    code, _, err = called("run", "rest", "--duration", 0.1, "--mavlink", "none", "--no-dashboard", *options)
+    assert code == 0, err
+    told = [line for line in err.splitlines() if "other machines" in line]
+    assert told == [f"feed {one}:{host}:0 can be reached from other machines; nothing is signed" for one in beyond]
+
+
+@pytest.mark.parametrize("kind", ["ardupilot-json", "px4", "vectornav"])
+def test_a_feed_listens_to_this_machine_alone_unless_told_otherwise(kind: Any) -> None:
+    listens = FeedConfig(kind=kind).listens
+    assert not listens or ipaddress.ip_address(listens.split(":")[1]).is_loopback
 
 
 @pytest.mark.parametrize(
