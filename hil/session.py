@@ -61,8 +61,8 @@ class _Part:
     process: BaseProcess
     connection: Connection
     answers: _Answers = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-    """What it has told at once, and nobody has taken yet."""
+    problems: list[tuple[str, str]] = field(default_factory=list)
+    """(severity, text) of what it has told at once, and nobody has taken yet."""
 
     def read(self) -> None:
         """Take what the process has answered."""
@@ -327,9 +327,7 @@ class Session:
 
     def _watch(self) -> None:
         for part in self._parts.values():
-            part.read()
-            self.problems += part.problems
-            part.problems.clear()
+            self._read(part)
             failed = part.answers.get("failed")
             died = part.process.exitcode not in (None, 0) and not failed
             if died:
@@ -344,6 +342,20 @@ class Session:
                     self.feeds.gone(part.name)
         for name in READERS:
             self._look_at(name)
+
+    def _read(self, part: _Part) -> None:
+        part.read()
+        for severity, text in part.problems:
+            self.problems.append(text)
+            self._tell_stations(severity, text)
+        part.problems.clear()
+
+    def _tell_stations(self, severity: str, text: str) -> None:
+        """Have the publisher say it on every link; one that does not answer is not waited for."""
+        publisher = self._parts.get("publisher")
+        if publisher is not None and "publisher" not in self._stopped:
+            with contextlib.suppress(OSError):  # it is gone
+                publisher.connection.send((severity, text))
 
     def _look_at(self, reader: str) -> None:
         """Say that a reader has stopped, or goes on."""
@@ -365,6 +377,7 @@ class Session:
         self._notes.append((0.0 if state is None else float(state["time"]), severity, text))
         if problem:
             self.problems.append(text)
+        self._tell_stations(severity, text)
 
     def _end(self) -> None:
         self._ended = time.monotonic()
@@ -398,9 +411,7 @@ class Session:
                 self.problems.append(f"the {name} process did not end and was killed")
             if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
-            part.read()
-            self.problems += part.problems
-            part.problems.clear()
+            self._read(part)
 
     def _answers(self, name: str) -> _Answers:
         part = self._parts[name]
