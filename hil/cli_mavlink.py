@@ -34,10 +34,13 @@ def with_mavlink(scenario: Scenario, key: Path | None, tlog: Path | None) -> Sce
 
 def open_doors(scenario: Scenario) -> list[str]:
     """A line for each link and each feed that other machines can reach."""
-    how = "signed messages alone are taken" if scenario.mavlink.signing_key else "nothing is signed"
     urls = ((link if isinstance(link, str) else link.url).partition("?")[0] for link in scenario.mavlink.links)
-    doors = [("MAVLink", url, how) for url in urls]
-    doors += [(f"feed {feed.kind}", feed.listens, "nothing is signed") for feed in scenario.feed]
-    return [
-        f"{what} on {url} can be reached from other machines; {how}" for what, url, how in doors if listens_beyond(url)
-    ]
+    lines = [door("MAVLink", url, signed=bool(scenario.mavlink.signing_key)) for url in urls]
+    lines += [door(f"feed {feed.kind}", feed.listens, signed=False) for feed in scenario.feed]
+    return [line for line in lines if line]
+
+
+def door(what: str, url: str, *, signed: bool) -> str:
+    """What to tell of the link `url`; empty where it is of this machine alone."""
+    how = "signed messages alone are taken" if signed else "nothing is signed"
+    return f"{what} on {url} can be reached from other machines; {how}" if listens_beyond(url) else ""

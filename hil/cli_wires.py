@@ -2,11 +2,12 @@
 
 from collections.abc import Iterator
 
+from hil.cli_mavlink import door
 from hil.scenario import Scenario
 
 
 def look_before(scenario: Scenario) -> Iterator[str]:
-    """Listen to the serial ports of a run; a warning for each that says nothing of use.
+    """Look at the bus of a run and listen to its serial ports; a warning for each that other machines can reach or is of no use.
 
     Raises
     ------
@@ -17,6 +18,9 @@ def look_before(scenario: Scenario) -> Iterator[str]:
         from drivers.can.bus import check_url
 
         check_url(scenario.bus)
+    kind, _, link = scenario.bus.partition(":")
+    if kind == "mavlink" and (line := door("MAVLink", link.partition("?")[0], signed="signing_key=" in link)):
+        yield line
     if scenario.receiver:
         from drivers.serial.probe import check_receiver
 

@@ -96,10 +96,11 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
     stop : Wake
         Ends the publisher.
     report : Connection
-        Brings (severity, text) of what is to be said on every link. Gets one dictionary at the end: ``sent`` and
-        ``received`` (by message), ``refused`` (by reason), ``bad_data``, ``dropped``, ``lost``, ``links`` (the same for each URL), ``latency_us`` (arrival of the sample to its ATTITUDE on a
-        link, `None` without one) and, where measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
-        ``failed``, a text, when a link could not be opened or the configuration is wrong.
+        Brings (severity, text) of what is to be said on every link. Gets one dictionary at the end: ``sent`` and ``received``
+        (by message), ``refused`` (by reason), ``bad_data``, ``dropped``, ``lost``, ``links`` (the same for each URL),
+        ``latency_us`` (arrival of the sample to its ATTITUDE on a link, `None` without one) and, where measurements are taken,
+        ``aiding`` (``taken`` by message, ``refused`` by reason); or ``failed``, a text, when a link could not be
+        opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:

@@ -98,9 +98,9 @@ def check_url(url: str) -> None:
 
         parts_of(url)
     elif interface == "mavlink":
-        from drivers.mavlink.link import parts_of as link_parts
+        from drivers.mavlink.port import input_of
 
-        link_parts(url.partition(":")[2])
+        input_of(url.partition(":")[2])
     elif interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted({"serial", "mavlink", *can.VALID_INTERFACES}))
         raise HilError(f"bus {url!r}: nobody knows an interface {interface!r}; there is: {known}")
