@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from hil import cli_watch
+from hil import cli_version, cli_watch
 from nav.errors import HilError
 
 if TYPE_CHECKING:
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 COMMON_BUS = "unix:dtg-hil"
 """Where `hil imu` and `hil run --imu` meet when no bus is named."""
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 
+app.callback(help=__doc__)(cli_version.root)
 app.command()(cli_watch.check_axes)
 app.command()(cli_watch.monitor)
 
@@ -544,12 +545,7 @@ def bench(
         print(f"{row['id']:36} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
-@app.command()
-def version() -> None:
-    """Print the version."""
-    from importlib.metadata import version as installed
-
-    print(f"dtg-hil {installed('dtg-hil')}")
+app.command()(cli_version.version)
 
 
 class _Screen(NamedTuple):

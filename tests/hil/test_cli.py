@@ -8,6 +8,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from commands import called
 from drivers.can.convert import to_message
 from drivers.can.dtg_head_emulator import HeadEncoder
 from drivers.can.frames import FrameArray
+from drivers.mavlink.commands import autopilot_version
 
 Cli = Callable[..., tuple[int, str, str]]
 HIL = (sys.executable, "-c", "from hil.cli import main; main()")
@@ -338,10 +340,14 @@ def test_doctor(hil: Cli) -> None:
     assert any("CAN" in finding["what"] for finding in findings)
 
 
-def test_version(hil: Cli) -> None:
-    code, out, _ = hil("version")
-    assert code == 0
-    assert out.startswith("dtg-hil ")
+@pytest.mark.parametrize("asked", ["--version", "version"])
+def test_the_version_is_that_of_the_package_and_of_autopilot_version(hil: Cli, asked: str) -> None:
+    code, out, err = hil(asked)
+    assert (code, err) == (0, "")
+    name, version, _, number = out.replace(")", "").split()
+    assert (name, version) == ("dtg-hil", installed("dtg-hil"))
+    assert int(number, 16) == autopilot_version().flight_sw_version
+    assert [int(number, 16) >> shift & 255 for shift in (24, 16, 8)] == [int(part) for part in version.split(".")[:3]]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
