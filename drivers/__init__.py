@@ -72,7 +72,7 @@ class FrameDriver(Protocol):
 class BoardEmulator(Protocol):
     """The other end of a driver of `ImuIncrements`, found by the entry-point group `dtg_hil.emulators` under the driver's name.
 
-    It is made with the sample period in us.
+    It is made with the sample period in us and, as ``option``, with what follows ``@`` in the driver's name.
     """
 
     frames_per_sample: int
@@ -124,11 +124,17 @@ def make_emulator(name: str, period_us: int) -> BoardEmulator:
     Raises
     ------
     HilError
-        The board cannot be emulated; names those that can. Or it has no such period.
+        The board cannot be emulated; names those that can. Or it has no such period, or takes no option.
     """
+    bare, at, option = name.partition("@")
     for point in entry_points(group="dtg_hil.emulators"):
-        if point.name == name.partition("@")[0]:
-            emulator: BoardEmulator = point.load()(period_us)
+        if point.name == bare:
+            try:
+                emulator: BoardEmulator = point.load()(period_us, **({"option": option} if at else {}))
+            except TypeError as error:
+                if not at:
+                    raise
+                raise HilError(f"driver {bare!r} takes no option: leave @{option} out") from error
             return emulator
     raise HilError(f"no emulator of {name!r}; there is: dtg-head, {', '.join(emulator_names())}")
 

@@ -455,6 +455,8 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         result = loop.result() | {"overflowed": source.overflowed}
         if granted:
             result["realtime"] = granted.as_dict()
+        if source.refused:
+            result["refused"] = dict(source.refused)
         if source.problem():
             result["problem"] = source.problem()
         stats["phase"] = Phase.DONE

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from hil import cli_watch
+from hil import cli_version, cli_watch
 from nav.errors import HilError
 
 if TYPE_CHECKING:
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 COMMON_BUS = "unix:dtg-hil"
 """Where `hil imu` and `hil run --imu` meet when no bus is named."""
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=__doc__)
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 
+app.callback(help=__doc__)(cli_version.root)
 app.command()(cli_watch.check_axes)
 app.command()(cli_watch.monitor)
 
@@ -99,6 +100,7 @@ def run(
 ) -> None:
     """Run the bridge: IMU in, navigation, MAVLink out. Without a bus it brings its own simulated head."""
     from hil.bridge import LoopOrder
+    from hil.cli_wires import look_before
     from hil.scenario import load
     from hil.session import simulated_head
 
@@ -115,16 +117,8 @@ def run(
         )
     if chosen.receiver and not _paced(speed):
         raise HilError("--speed max has no time in which a receiver could speak: leave it or the receivers out")
-    for receiver in chosen.receiver:
-        from drivers.serial.probe import check_receiver
-
-        if warning := check_receiver(receiver.port):
-            _say(warning)
-    if chosen.bus.startswith("serial:"):
-        from drivers.serial.probe import check_port
-
-        if warning := check_port(chosen.bus, chosen.driver):
-            _say(warning)
+    for warning in look_before(chosen):
+        _say(warning)
     order = LoopOrder(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
@@ -147,12 +141,14 @@ def imu(
     as_json: Json = False,
 ) -> None:
     """Run the simulated sensor head alone, for a bridge in another process or on another machine."""
+    from drivers.can.bus import check_url
     from hil.realtime import claim
     from hil.scenario import load
     from hil.world.head import SimulatedHead, feed
 
     chosen = load(scenario).with_changes(**_changes(bus=bus, duration_s=duration, seed=seed))
     chosen = chosen.with_changes(bus=chosen.bus or COMMON_BUS)
+    check_url(chosen.bus)
     stop = StopSignal()
     head = SimulatedHead(chosen)
     for lack in claim().lacking if realtime else ():
@@ -549,12 +545,7 @@ def bench(
         print(f"{row['id']:36} {row['what']:58} {row['ns']:10.0f} ns{ratio}")
 
 
-@app.command()
-def version() -> None:
-    """Print the version."""
-    from importlib.metadata import version as installed
-
-    print(f"dtg-hil {installed('dtg-hil')}")
+app.command()(cli_version.version)
 
 
 class _Screen(NamedTuple):

@@ -33,11 +33,14 @@ def with_mavlink(scenario: Scenario, key: Path | None, tlog: Path | None) -> Sce
 
 
 def open_doors(scenario: Scenario) -> list[str]:
-    """A line for each link that other machines can reach."""
-    lines = []
-    for link in scenario.mavlink.links:
-        url = (link if isinstance(link, str) else link.url).partition("?")[0]
-        if listens_beyond(url):
-            how = "signed messages alone are taken" if scenario.mavlink.signing_key else "nothing is signed"
-            lines.append(f"MAVLink on {url} can be reached from other machines; {how}")
-    return lines
+    """A line for each link and each feed that other machines can reach."""
+    urls = ((link if isinstance(link, str) else link.url).partition("?")[0] for link in scenario.mavlink.links)
+    lines = [door("MAVLink", url, signed=bool(scenario.mavlink.signing_key)) for url in urls]
+    lines += [door(f"feed {feed.kind}", feed.listens, signed=False) for feed in scenario.feed]
+    return [line for line in lines if line]
+
+
+def door(what: str, url: str, *, signed: bool) -> str:
+    """What to tell of the link `url`; empty where it is of this machine alone."""
+    how = "signed messages alone are taken" if signed else "nothing is signed"
+    return f"{what} on {url} can be reached from other machines; {how}" if listens_beyond(url) else ""

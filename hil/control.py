@@ -22,7 +22,9 @@ _STOP, _GO, _ALIGN_REQUESTS, _LOST, _SAMPLES, _RECORDED, _LOOP_PID, _LOOP_DONE, 
     16
 )
 _MARKS, _RECORDING, _RECORD_SINCE, _FAULT, _FAULTS, _FIELDS = _REST
-READERS = {"publisher": _PUBLISHER, "recorder": _RECORDER}
+FEEDS = 16
+"""Most feeds of a run."""
+READERS = {"publisher": _PUBLISHER, "recorder": _RECORDER, **{f"feed {k}": _FIELDS + k for k in range(FEEDS)}}
 """Processes that say with a beat that they are at work."""
 
 ORPHAN_S = 10.0
@@ -46,8 +48,8 @@ class Control:
     """Shared numbers; survives being passed to a spawned process."""
 
     def __init__(self, shared: Shared | None = None) -> None:
-        self._shared = Shared(8 * _FIELDS) if shared is None else shared
-        self._values = np.frombuffer(self._shared.memory, np.int64, _FIELDS)
+        self._shared = Shared(8 * (_FIELDS + FEEDS)) if shared is None else shared
+        self._values = np.frombuffer(self._shared.memory, np.int64, _FIELDS + FEEDS)
 
     def __reduce__(self) -> Any:
         return Control, (self._shared,)

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 from drivers import driver_names
-from drivers.can.interface import link
+from drivers.can.interface import Link, link
+from drivers.can.socketcan import CANFD_MTU
 from drivers.utc import PULSES
 from hil.realtime import refused
 from nav.errors import HilError
@@ -97,19 +98,24 @@ def _can(*, probe: bool) -> Iterator[Finding]:
 
 def _interface(name: str) -> Finding:
     """State of a CAN interface: of the network's side, and of its controller where it has one."""
-    flags = int((Path("/sys/class/net") / name / "flags").read_text(), 16)
-    mtu = (Path("/sys/class/net") / name / "mtu").read_text().strip()
-    known = link(name)
-    parts = ["up" if flags & 1 else "down", f"mtu {mtu}", known.state]
+    flags, mtu = ((Path("/sys/class/net") / name / what).read_text() for what in ("flags", "mtu"))
+    return judged(name, link(name), up=bool(int(flags, 16) & 1), mtu=int(mtu))
+
+
+def judged(name: str, known: Link, *, up: bool, mtu: int) -> Finding:
+    """What is to be said of the CAN interface `name`; `mtu` is that of CAN FD, or of classic CAN."""
+    parts = ["up" if up else "down", f"mtu {mtu}", known.state]
     parts += [f"{rate} bit/s" for rate in (known.bitrate, known.data_bitrate) if rate]
-    good = bool(flags & 1) and mtu == "72"
-    mend = "" if good else f"sudo ip link set {name} down; sudo ip link set {name} mtu 72 up"
+    classic = mtu < CANFD_MTU
+    parts += [f"classic CAN only: FD layouts need mtu {CANFD_MTU}"] if classic else []
+    verdict: Verdict = "info" if classic else "ok"
+    mend = ""
+    if not up:
+        verdict, mend = "lack", f"sudo ip link set {name} up"
     if known.state in TROUBLED:
-        good, mend = (
-            False,
-            f"mend wiring, termination or bit rate; then: sudo ip link set {name} down; sudo ip link set {name} up",
-        )
-    return Finding(name, "ok" if good else "lack", ", ".join(part for part in parts if part), mend)
+        verdict = "lack"
+        mend = f"mend wiring, termination or bit rate; then: sudo ip link set {name} down; sudo ip link set {name} up"
+    return Finding(name, verdict, ", ".join(part for part in parts if part), mend)
 
 
 def _board_on_can(name: str) -> Finding:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from drivers.can.aiding import AidingEncoder, merge
-from drivers.can.bus import open_port
+from drivers.can.bus import check_url, open_port
 from drivers.can.dtg_head_emulator import REPLAY, HeadEncoder
 from drivers.can.frames import FrameArray, frames
 from drivers.logs.imu_log import ImuLog
@@ -49,8 +49,10 @@ def plan_replay(path: Path, scenario_file: str | None, bus: str | None, *, paced
     Raises
     ------
     HilError
-        The file cannot be read or is of no kind that is known.
+        The file cannot be read or is of no kind that is known; the URL of the bus is malformed.
     """
+    if bus is not None:
+        check_url(bus)
     suffix = path.suffix.lower()
     if is_flight_log(path):
         log = read_flight_log(path)

@@ -101,10 +101,11 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
     stop : Wake
         Ends the publisher.
     report : Connection
-        Gets one dictionary at the end: ``sent`` and ``received`` (by message), ``refused`` (by reason), ``bad_data``,
-        ``dropped``, ``lost``, ``links`` (the same for each URL), ``latency_us`` (arrival of the sample to its ATTITUDE on a
-        link, `None` without one) and, where measurements are taken, ``aiding`` (``taken`` by message, ``refused`` by reason); or
-        ``failed``, a text, when a link could not be opened or the configuration is wrong.
+        Brings (severity, text) of what is to be said on every link. Gets one dictionary at the end: ``sent`` and ``received``
+        (by message), ``refused`` (by reason), ``bad_data``, ``dropped``, ``lost``, ``links`` (the same for each URL),
+        ``latency_us`` (arrival of the sample to its ATTITUDE on a link, `None` without one) and, where measurements are taken,
+        ``aiding`` (``taken`` by message, ``refused`` by reason); or ``failed``, a text, when a link could not be
+        opened or the configuration is wrong.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
@@ -159,8 +160,7 @@ class _Publisher:
 
     def run(self, stop: Wake, report: Connection) -> None:
         self._selector.register(stop, selectors.EVENT_READ)
-        self._selector.register(report, selectors.EVENT_READ)  # readable: the parent is gone
-        ends = (stop, report)
+        self._selector.register(report, selectors.EVENT_READ)
         next_s = time.monotonic()
         while True:
             self._control.beat("publisher")
@@ -171,9 +171,17 @@ class _Publisher:
                 self._selector.unregister(self._loop)
                 if self._control.loop_pid:
                     self._say_died()
-            if any(one in ends for one in ready):
+            if stop in ready or (report in ready and not self._hear(report)):
                 return
             next_s = self._step(self._wake in ready)
+
+    def _hear(self, report: Connection) -> bool:
+        """Say what the session wants said; False when it is gone."""
+        try:
+            self._station.tell(*report.recv())
+        except (EOFError, OSError):
+            return False
+        return True
 
     def _watch_loop(self, pid: int) -> None:
         try:

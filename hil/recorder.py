@@ -16,8 +16,8 @@ from nav.errors import HilError
 def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: Connection) -> None:
     """Record until the loop is done or hands on no more, and the ring is empty.
 
-    Answers ``{"file", "frames", "lost"}`` or ``{"failed"}``; ``{"problem": text}`` goes out at once when the disk takes no
-    more, and when it does again.
+    Answers ``{"file", "frames", "lost"}`` or ``{"failed"}``; ``{"problem": (severity, text)}`` goes out at once when the disk
+    takes no more, and when it does again.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ring, control, stats = outlets.frames, outlets.control, outlets.stats
@@ -39,7 +39,7 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
                 stats["recorder_lost"] = before + lost + writer.lost
                 if writer.problem != problem:
                     problem = writer.problem
-                    answer.send({"problem": f"recorder: {_news(writer)}"})
+                    answer.send({"problem": ("error" if problem else "notice", f"recorder: {_news(writer)}")})
                 control.recorded = first + copied
                 if copied == 0:
                     if done:

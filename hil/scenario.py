@@ -460,7 +460,7 @@ class Scenario(_Model):
     receiver: Annotated[tuple[ReceiverConfig, ...], Field(max_length=16)] = ()
     navigation: NavigationConfig = NavigationConfig()
     mavlink: MavlinkConfig = MavlinkConfig()
-    feed: tuple[FeedConfig, ...] = ()
+    feed: Annotated[tuple[FeedConfig, ...], Field(max_length=16)] = ()
     """Autopilots that are given the solution (:mod:`hil.feed`)."""
 
     @model_validator(mode="after")

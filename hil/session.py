@@ -61,8 +61,8 @@ class _Part:
     process: BaseProcess
     connection: Connection
     answers: _Answers = field(default_factory=dict)
-    problems: list[str] = field(default_factory=list)
-    """What it has told at once, and nobody has taken yet."""
+    problems: list[tuple[str, str]] = field(default_factory=list)
+    """(severity, text) of what it has told at once, and nobody has taken yet."""
 
     def read(self) -> None:
         """Take what the process has answered."""
@@ -193,7 +193,7 @@ class Session:
             shared = outlets.stats, outlets.fixes, self.links, self.order.realtime and self.order.live
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
-        self.feeds.launch(launch, outlets.states, 1)
+        self.feeds.launch(launch, outlets.states, 1, outlets.control)
         for k, (name, config) in enumerate(self._receivers.items()):
             launch(name, run_receiver, config, k, outlets.stats, outlets.aiding[1 + k], outlets.control)
 
@@ -327,9 +327,7 @@ class Session:
 
     def _watch(self) -> None:
         for part in self._parts.values():
-            part.read()
-            self.problems += part.problems
-            part.problems.clear()
+            self._read(part)
             failed = part.answers.get("failed")
             died = part.process.exitcode not in (None, 0) and not failed
             if died:
@@ -345,6 +343,20 @@ class Session:
         for name in READERS:
             self._look_at(name)
 
+    def _read(self, part: _Part) -> None:
+        part.read()
+        for severity, text in part.problems:
+            self.problems.append(text)
+            self._tell_stations(severity, text)
+        part.problems.clear()
+
+    def _tell_stations(self, severity: str, text: str) -> None:
+        """Have the publisher say it on every link; one that does not answer is not waited for."""
+        publisher = self._parts.get("publisher")
+        if publisher is not None and "publisher" not in self._stopped:
+            with contextlib.suppress(OSError):  # it is gone
+                publisher.connection.send((severity, text))
+
     def _look_at(self, reader: str) -> None:
         """Say that a reader has stopped, or goes on."""
         part = self._parts.get(reader)
@@ -353,11 +365,9 @@ class Session:
         stopped = self.outlets.control.beat_age_s(reader) > STOPPED_S
         if stopped and reader not in self._stopped:
             self._stopped.add(reader)
-            self._note(
-                f"the {reader} process does not answer: it is stopped or starved, and nothing waits for it",
-                "error",
-                problem=True,
-            )
+            waits = "nothing" if self.order.paced or reader == "publisher" else "simulated time"
+            text = f"the {reader} process does not answer: it is stopped or starved, and {waits} waits for it"
+            self._note(text, "error", problem=True)
         elif not stopped and reader in self._stopped:
             self._stopped.discard(reader)
             self._note(f"the {reader} process answers again", "notice")
@@ -367,6 +377,7 @@ class Session:
         self._notes.append((0.0 if state is None else float(state["time"]), severity, text))
         if problem:
             self.problems.append(text)
+        self._tell_stations(severity, text)
 
     def _end(self) -> None:
         self._ended = time.monotonic()
@@ -400,9 +411,7 @@ class Session:
                 self.problems.append(f"the {name} process did not end and was killed")
             if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
-            part.read()
-            self.problems += part.problems
-            part.problems.clear()
+            self._read(part)
 
     def _answers(self, name: str) -> _Answers:
         part = self._parts[name]

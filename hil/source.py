@@ -1,7 +1,7 @@
 """Where the loop's frames come from: a bus or a recording, behind the same `receive`."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,6 +34,10 @@ class Source(Protocol):
     @property
     def overflowed(self) -> int:
         """Frames that the kernel dropped because we did not take them in time."""
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """Packets whose signature was missing or wrong, by reason."""
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """As `drivers.can.bus.Port.receive`."""
@@ -74,7 +78,15 @@ class BusSource:
             said.append(
                 f"{self.overflowed} frames were lost because the receive buffer was full: raise net.core.rmem_max"
             )
+        if refused := ", ".join(f"{count} {reason}" for reason, count in self.refused.items()):
+            said.append(f"packets were refused: {refused}")
         return "; ".join(said)
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        """See `Source.refused`."""
+        counts: Mapping[str, int] = getattr(self._port, "refused", {})
+        return counts
 
     @property
     def overflowed(self) -> int:
@@ -96,6 +108,7 @@ class FileSource:
 
     trouble = ""
     overflowed = 0
+    refused: Mapping[str, int] = {}
 
     def __init__(self, path: Path, *, paced: bool) -> None:
         self.live = False

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.control import Control
 from hil.feed.common import ACTUATORS, Socket
 from hil.feed.config import FeedConfig
 from hil.feed.process import run_feed
@@ -46,7 +47,7 @@ class RunningFeed:
         self.actuators, self.gate = Ring(ACTUATORS, 16, 0), None if paced else Gate(1)
         self.stop, self.pushed = Wake(), 0
         self.report, theirs = _CONTEXT.Pipe()
-        socket = Socket(self.ring, 0, self.actuators, self.gate, 0)
+        socket = Socket(self.ring, 0, self.actuators, self.gate, 0, Control())
         arguments = (FeedConfig(**config), load(None).with_changes(**changes or {}), socket, self.stop, theirs)
         self.process = _CONTEXT.Process(target=run_feed, args=arguments, daemon=True)
         self.process.start()

@@ -20,7 +20,7 @@ import can
 from drivers.can.convert import from_message, to_message
 from drivers.can.frames import FrameArray
 from drivers.can.socketcan import SocketCanPort, explain, parse_filters
-from drivers.can.unix_bus import UnixPort
+from drivers.can.unix_bus import UnixPort, check_name
 from nav.errors import HilError
 
 RECEIVE_BUFFER = 8 << 20
@@ -61,13 +61,9 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
     HilError
         The URL is malformed or the bus cannot be opened; the message says how to make it.
     """
-    interface, separator, rest = url.partition(":")
-    channel, _, query = rest.partition("?")
-    if not separator or not channel:
-        raise HilError(f"bus {url!r}: expected INTERFACE:CHANNEL, as unix:dtg-hil or socketcan:vcan0")
+    check_url(url)
+    interface, channel, words = _parts(url)
     if interface == "unix":
-        if query:
-            raise HilError(f"bus {url!r}: unix: takes no options")
         return UnixPort(channel, listen=listen, lossless=lossless)
     if interface == "serial":
         from drivers.serial.port import SerialPort
@@ -80,13 +76,49 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
     if interface == "mavlink":
         from drivers.mavlink.port import MavlinkPort
 
-        return MavlinkPort(rest)
-    words = dict(parse_qsl(query, keep_blank_values=True))
+        return MavlinkPort(url.partition(":")[2])
     if interface == "socketcan" and words.keys() <= {"filter"}:
         filters = parse_filters(words["filter"]) if words else ()
         return SocketCanPort(channel, listen=listen, filters=filters)
     options = {key: _typed(value) for key, value in words.items()}
     return PythonCanPort(url, interface, channel, options)
+
+
+def check_url(url: str) -> None:
+    """Refuse a malformed URL; nothing is opened.
+
+    Raises
+    ------
+    HilError
+        The URL is malformed; the message says what was expected.
+    """
+    interface, channel, words = _parts(url)
+    if not channel:
+        raise HilError(f"bus {url!r}: expected INTERFACE:CHANNEL, as unix:dtg-hil or socketcan:vcan0")
+    if interface == "unix":
+        if "?" in url:
+            raise HilError(f"bus {url!r}: unix: takes no options")
+        check_name(channel)
+    elif interface == "serial":
+        from drivers.serial.port import parts_of
+
+        parts_of(url)
+    elif interface == "mavlink":
+        from drivers.mavlink.port import input_of
+
+        input_of(url.partition(":")[2])
+    elif interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted({"serial", "mavlink", *can.VALID_INTERFACES}))
+        raise HilError(f"bus {url!r}: nobody knows an interface {interface!r}; there is: {known}")
+    elif interface == "socketcan" and "filter" in words:
+        parse_filters(words["filter"])
+
+
+def _parts(url: str) -> tuple[str, str, dict[str, str]]:
+    """Interface, channel and options of a URL; empty where it does not say."""
+    interface, _, rest = url.partition(":")
+    channel, _, query = rest.partition("?")
+    return interface, channel, dict(parse_qsl(query, keep_blank_values=True))
 
 
 class PythonCanPort:

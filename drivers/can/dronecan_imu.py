@@ -38,6 +38,14 @@ FITS = 0.02
 """An interval that is the sample period but for this is all of the step; of another one the mean is taken."""
 
 
+def node_of(option: str) -> int:
+    """The node id that follows ``@``, 1 to 127; 0 where there is none. Another text is a `HilError`."""
+    node = int(option) if option.isascii() and option.isdigit() else 0
+    if option and not 1 <= node <= 127:
+        raise HilError(f"dronecan-imu@{option}: give a node id from 1 to 127")
+    return node
+
+
 class DronecanImu:
     """See the module; satisfies `drivers.FrameDriver`.
 
@@ -55,9 +63,7 @@ class DronecanImu:
     world_id = 0
 
     def __init__(self, option: str = "") -> None:
-        self._node = int(option) if option.isascii() and option.isdigit() else 0
-        if option and not 1 <= self._node <= 127:
-            raise HilError(f"dronecan-imu@{option}: give a node id from 1 to 127")
+        self._node = node_of(option)
         self.counters = Counters()
         self._samples: Samples | None = None
         self._stamped = True

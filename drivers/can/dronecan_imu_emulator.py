@@ -4,7 +4,7 @@ from binascii import crc_hqx
 
 import numpy as np
 
-from drivers.can.dronecan_imu import BASE_CRC, COUNTER, END, START, TOGGLE, TYPE, VALUES
+from drivers.can.dronecan_imu import BASE_CRC, COUNTER, END, START, TOGGLE, TYPE, VALUES, node_of
 from drivers.can.emulation import EndRates, check_period, stamp
 from drivers.can.frames import EFF, FrameArray, frames
 from nav.increments import ImuIncrements
@@ -25,6 +25,8 @@ class DronecanEmulator:
         Send integrals beside the latest rates; False: an interval of 0.
     stamped : bool
         Put its time into the messages.
+    option : str
+        That of the driver: the node which it follows.
 
     Raises
     ------
@@ -34,9 +36,11 @@ class DronecanEmulator:
 
     frames_per_sample = 7
 
-    def __init__(self, period_us: int, node: int = 42, *, integrals: bool = True, stamped: bool = True) -> None:
+    def __init__(
+        self, period_us: int, node: int = 42, *, integrals: bool = True, stamped: bool = True, option: str = ""
+    ) -> None:
         check_period("a DroneCAN node", period_us, least_us=1000, grid_us=1)
-        self._can_id = EFF | PRIORITY << 24 | TYPE << 8 | node
+        self._can_id = EFF | PRIORITY << 24 | TYPE << 8 | (node_of(option) or node)
         self._integrals, self._stamped, self._ends, self._transfer = integrals, stamped, EndRates(), 0
 
     def slow(self) -> FrameArray:

@@ -89,6 +89,18 @@ def _pair(
     return n
 
 
+def node_of(option: str) -> tuple[int | None, FloatArray]:
+    """Source address (None: any) and signs of the rates (3,) that follow ``@``. Another text is a `HilError`."""
+    words = option.split(",") if option else []
+    try:
+        sources = [int(word, 0) for word in words if word != "z-up"]
+    except ValueError:
+        sources = [-1]
+    if len(sources) > 1 or any(not 0 <= source < 254 for source in sources):
+        raise HilError(f"j1939-imu@{option}: give a source address 0..253, z-up, or both as 226,z-up")
+    return sources[0] if sources else None, FLIP if "z-up" in words else np.ones(3)
+
+
 class J1939Imu:
     """See the module; satisfies `drivers.FrameDriver`.
 
@@ -106,18 +118,11 @@ class J1939Imu:
     world_id = 0
 
     def __init__(self, option: str = "") -> None:
-        words = option.split(",") if option else []
-        try:
-            sources = [int(word, 0) for word in words if word != "z-up"]
-        except ValueError:
-            sources = [-1]
-        if len(sources) > 1 or any(not 0 <= source < 254 for source in sources):
-            raise HilError(f"j1939-imu@{option}: give a source address 0..253, z-up, or both as 226,z-up")
+        self._source, turn = node_of(option)
         database = j1939_database()
         self._slope = database["SSI2"]
         self._codecs = [(database["ARI"], RATES), (database["ACCS"], FORCES)]
-        self._scale = np.radians(1.0) * (FLIP if "z-up" in words else np.ones(3)), FLIP
-        self._source: int | None = sources[0] if sources else None
+        self._scale = np.radians(1.0) * turn, FLIP
         self.counters = Counters()
         self._samples = Samples(self.counters, TICK_S, GRID_S)
         self._state, self._held = np.array([-1, 0, 0, 0, 0, 0]), np.zeros(4)

@@ -4,7 +4,7 @@ import numpy as np
 
 from drivers.can.emulation import EndRates, check_period, put, rounded, stamp
 from drivers.can.frames import FrameArray, frames
-from drivers.can.j1939 import FORCES, RATES, j1939_database
+from drivers.can.j1939 import FORCES, RATES, j1939_database, node_of
 from drivers.can.samples import FLIP
 from nav.increments import FloatArray, ImuIncrements, IntArray
 
@@ -21,6 +21,8 @@ class J1939Emulator:
         Sample period.
     source : int
         Source address.
+    option : str
+        That of the driver: the address and the axes that it expects.
 
     Raises
     ------
@@ -30,10 +32,12 @@ class J1939Emulator:
 
     frames_per_sample = 2
 
-    def __init__(self, period_us: int, source: int = 0xE2) -> None:
+    def __init__(self, period_us: int, source: int = 0xE2, *, option: str = "") -> None:
         check_period("a J1939 sensor", period_us, least_us=5000, grid_us=5000)
         database = j1939_database()
-        self._rates, self._forces, self._source = database["ARI"], database["ACCS"], source
+        followed, self._turn = node_of(option)
+        self._source = source if followed is None else followed
+        self._rates, self._forces = database["ARI"], database["ACCS"]
         self._ends = EndRates()
 
     def slow(self) -> FrameArray:
@@ -46,7 +50,7 @@ class J1939Emulator:
         batch = frames(2 * len(imu))
         put(
             self._rates,
-            _raw(RATES, np.degrees(ends[:, :3]), 1.0 / 128.0) | {"latency": np.full(len(imu), 10)},
+            _raw(RATES, np.degrees(self._turn * ends[:, :3]), 1.0 / 128.0) | {"latency": np.full(len(imu), 10)},
             batch[0::2],
         )
         put(self._forces, _raw(FORCES, FLIP * ends[:, 3:], 0.01), batch[1::2])

@@ -28,7 +28,7 @@ BURST = 64
 RECEIVE_BUFFER = 8 << 20
 REOPEN_S = 0.5
 """Time between tries to reopen an interface that failed."""
-_CAN_MTU, _CANFD_MTU = 16, 72
+_CAN_MTU, CANFD_MTU = 16, 72
 _SECOND = 1_000_000_000
 _NANOSECONDS = np.array([_SECOND, 1])
 _SO_TIMESTAMPNS, _SO_TIMESTAMPING, _SO_RXQ_OVFL, _SO_RCVBUFFORCE, _CAN_RAW_ERR_FILTER = 35, 37, 40, 33, 2
@@ -110,7 +110,7 @@ class SocketCanPort:
         self._messages = (_Message * BURST)()
         for k in range(BURST):
             self._vectors[k].base = self._frames.ctypes.data + k * FRAME.itemsize + 8
-            self._vectors[k].length = _CANFD_MTU
+            self._vectors[k].length = CANFD_MTU
             self._messages[k].vectors = ctypes.addressof(self._vectors[k])
             self._messages[k].vector_count = 1
             self._messages[k].control = self._control.ctypes.data + k * _CONTROL.itemsize
@@ -205,7 +205,7 @@ class SocketCanPort:
         taken, control = self._frames[:got], self._control[:got]
         kernel, adapter = control["seconds"] * _SECOND + control["nanoseconds"], control["stamps"][:, 2]
         taken["time_ns"] = self._clock.arrivals(kernel, adapter @ _NANOSECONDS) if adapter.any() else kernel
-        taken["flags"] = np.where(self._lengths[:got] == _CANFD_MTU, taken["flags"] | FDF, 0)
+        taken["flags"] = np.where(self._lengths[:got] == CANFD_MTU, taken["flags"] | FDF, 0)
         taken["reserved"] = 0
         if self._control_lengths[got - 1] > _STAMP_LENGTH:
             self.overflowed = self._overflow_base + int(control["dropped"][got - 1])

@@ -54,8 +54,7 @@ class UnixPort:
     """
 
     def __init__(self, name: str, *, listen: bool = True, lossless: bool = False) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9._-]{1,40}", name) or name.startswith("."):
-            raise HilError(f"unix:{name}: a bus name has 1 to 40 letters, digits, dots, dashes or underscores")
+        check_name(name)
         self.name = name
         self.dropped = 0
         """Frames that did not fit into a listener's queue."""
@@ -241,6 +240,12 @@ class UnixBus(can.BusABC):
             self._either.close()
             os.close(self._waiting)
         super().shutdown()
+
+
+def check_name(name: str) -> None:
+    """Refuse (`HilError`) what is no name of a bus."""
+    if not re.fullmatch(r"[A-Za-z0-9._-]{1,40}", name) or name.startswith("."):
+        raise HilError(f"unix:{name}: a bus name has 1 to 40 letters, digits, dots, dashes or underscores")
 
 
 def _alive(peer: socket.socket) -> bool:

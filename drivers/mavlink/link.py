@@ -68,6 +68,29 @@ def open_link(url: str) -> "Link | Listener":
     HilError
         The URL is malformed, its host is unknown, its port is in use, or its device cannot be opened.
     """
+    kind, place, number = parts_of(url)
+    try:
+        if kind == "serial":
+            return StreamLink(url, lambda: serial.Serial(place, number, timeout=0, write_timeout=0, exclusive=True))
+        family, address = _resolve(url, place, number, kind.startswith("udp"))
+        if kind.startswith("udp"):
+            return UdpLink(url, family, address, listen=kind == "udpin")
+        if kind == "tcp":
+            return StreamLink(url, lambda: _dial(family, address), lazy=True)
+        return Listener(url, socket.create_server(address, family=family, backlog=CLIENTS))
+    except (OSError, ValueError, OverflowError) as error:  # pyserial's errors are OSErrors
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
+        raise HilError(f"MAVLink link {url!r}: cannot open it: {reason}") from error
+
+
+def parts_of(url: str) -> tuple[str, str, int]:
+    """Kind, host or device, and port or baud rate of a URL.
+
+    Raises
+    ------
+    HilError
+        The URL is malformed.
+    """
     kind, _, rest = url.partition(":")
     place, _, number = rest.rpartition(":")
     if kind not in ("udpout", "udpin", "tcp", "tcpin", "serial"):
@@ -79,20 +102,7 @@ def open_link(url: str) -> "Link | Listener":
     if not (number.isascii() and number.isdigit() and lowest <= int(number) <= highest):
         what = "baud rate" if kind == "serial" else "port"
         raise HilError(f"MAVLink link {url!r}: {what} {number!r} is not a whole number from {lowest} to {highest}")
-    try:
-        if kind == "serial":
-            return StreamLink(
-                url, lambda: serial.Serial(place, int(number), timeout=0, write_timeout=0, exclusive=True)
-            )
-        family, address = _resolve(url, place, int(number), kind.startswith("udp"))
-        if kind.startswith("udp"):
-            return UdpLink(url, family, address, listen=kind == "udpin")
-        if kind == "tcp":
-            return StreamLink(url, lambda: _dial(family, address), lazy=True)
-        return Listener(url, socket.create_server(address, family=family, backlog=CLIENTS))
-    except (OSError, ValueError, OverflowError) as error:  # pyserial's errors are OSErrors
-        reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        raise HilError(f"MAVLink link {url!r}: cannot open it: {reason}") from error
+    return kind, place, int(number)
 
 
 def listens_beyond(url: str) -> bool:

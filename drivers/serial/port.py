@@ -43,7 +43,7 @@ class SerialPort:
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self.place, self.baud = _parts(url)
+        self.place, self.baud = parts_of(url)
         self.dropped = 0
         """Chunks that the port did not take."""
         self.failures = 0
@@ -138,8 +138,14 @@ def _writable(fd: int, deadline: float) -> bool:
     return bool(ready) and not ready[0][1] & _LOST
 
 
-def _parts(url: str) -> tuple[str, int]:
-    """Device or pyserial URL, and baud rate (that of a network port is set at its other end)."""
+def parts_of(url: str) -> tuple[str, int]:
+    """Device or pyserial URL, and baud rate (that of a network port is set at its other end).
+
+    Raises
+    ------
+    HilError
+        The URL is malformed.
+    """
     kind, _, rest = url.partition(":")
     place, _, baud = rest.rpartition(":")
     if kind == "serial" and rest.startswith("socket://") and place.count(":") == 1 and baud.isdigit():

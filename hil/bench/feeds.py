@@ -11,6 +11,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from hil.bench.timing import Row, Sizes, Work, rows_in_turns
+from hil.control import Control
 from hil.feed.common import ACTUATORS, Socket
 from hil.feed.config import FeedConfig
 from hil.feed.process import run_feed
@@ -84,7 +85,7 @@ def _fed(kind: str) -> Iterator[tuple[int, Callable[[int], None]]]:
     context = multiprocessing.get_context("forkserver")
     states, stop = Ring(NAV_STATE, 4096, 1), Wake()
     report, theirs = context.Pipe()
-    joint = Socket(states, 0, Ring(ACTUATORS, 64, 0), Gate(1), 0)
+    joint = Socket(states, 0, Ring(ACTUATORS, 64, 0), Gate(1), 0, Control())
     config = FeedConfig.model_validate({"kind": kind, "address": "127.0.0.1:0"})
     process = context.Process(target=run_feed, args=(config, load(None), joint, stop, theirs), daemon=True)
     process.start()

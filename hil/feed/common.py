@@ -8,6 +8,7 @@ import numpy as np
 
 from drivers.mavlink.solution import Solution, Vector
 from drivers.mavlink.surroundings import Surroundings
+from hil.control import Control
 from hil.feed.config import FeedConfig
 from hil.feed.tap import Gate, Rows, mean_row
 from hil.geoid import undulation
@@ -45,6 +46,8 @@ class Socket:
         In simulated time.
     number : int
         Ours, there.
+    control : Control
+        Is told that we are at work.
     """
 
     states: Ring
@@ -52,6 +55,7 @@ class Socket:
     actuators: Ring
     gate: Gate | None
     number: int
+    control: Control
 
 
 class Feed(Protocol):

@@ -55,6 +55,14 @@ class FeedConfig(BaseModel):
         return self.address or DEFAULTS[self.kind]
 
     @property
+    def listens(self) -> str:
+        """Where the network may come in, as the URL of a link; empty: nowhere."""
+        kind, _, rest = self.place.partition(":")
+        if self.kind == "vectornav":
+            return f"tcpin:{rest}" if kind == "tcp" else ""
+        return f"{'tcpin' if self.kind == 'px4' else 'udpin'}:{self.place}"
+
+    @property
     def name(self) -> str:
         """Kind and address, as ``--feed`` takes them."""
         return f"{self.kind}:{self.place}"

@@ -3,14 +3,13 @@
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from hil.control import Control
 from hil.feed.common import ACTUATORS, Socket
 from hil.feed.process import run_feed
 from hil.feed.tap import Gate
 from hil.ring import Ring, Wake
 from hil.scenario import Scenario
 from nav.errors import HilError
-
-_NAME = "feed {}"
 
 
 class FeedGroup:
@@ -43,15 +42,15 @@ class FeedGroup:
         feeds = scenario.feed
         if not paced and any(feed.kind == "vectornav" for feed in feeds):
             raise HilError("a vectornav feed needs real time, for its wire cannot hold the time: use --speed 1")
-        self.names = [_NAME.format(number) for number in range(len(feeds))]
+        self.names = [f"feed {number}" for number in range(len(feeds))]
         self.gate = Gate(len(feeds)) if feeds and not paced else None
         self.actuators = [Ring(ACTUATORS, 64, 0) for _ in feeds]
         self._stops = [Wake() for _ in feeds]
 
-    def launch(self, launch: Callable[..., None], states: Ring, first_reader: int) -> None:
+    def launch(self, launch: Callable[..., None], states: Ring, first_reader: int, control: Control) -> None:
         """Start their processes by ``launch(name, target, *args)``; they have the wake-ups from `first_reader` on."""
         for number, feed in enumerate(self._scenario.feed):
-            joint = Socket(states, first_reader + number, self.actuators[number], self.gate, number)
+            joint = Socket(states, first_reader + number, self.actuators[number], self.gate, number, control)
             launch(self.names[number], run_feed, feed, self._scenario, joint, self._stops[number])
 
     def stop(self, name: str) -> None:

@@ -60,6 +60,7 @@ def _serve(feed: Feed, joint: Socket, stop: Wake, report: Connection, patience_s
             selector.register(one, selectors.EVENT_READ)
         next_s = 0.0
         while True:
+            joint.control.beat(f"feed {joint.number}")
             ready = [key.fileobj for key, _ in selector.select(max(0.0, next_s - time.monotonic()))]
             if stop in ready or report in ready:
                 return

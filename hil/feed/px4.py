@@ -35,7 +35,7 @@ class Px4Feed:
 
     def __init__(self, config: FeedConfig, scenario: Scenario, joint: Socket) -> None:
         try:
-            listener = open_link(f"tcpin:{config.place}")
+            listener = open_link(config.listens)
         except HilError as error:
             raise HilError(f"feed {config.name}: {error}") from error
         assert isinstance(listener, Listener)

@@ -102,9 +102,7 @@ class Tap:
         self.lost += first - self._number
         self._number = first
         rows, index, times = self._rows[:copied], self._index, self._times
-        there, self._shift, broken = _go_on(
-            rows["time"], rows["mode"], self._last, self._step, self._shift, index, times
-        )
+        there, shift, broken = _go_on(rows["time"], rows["mode"], self._last, self._step, self._shift, index, times)
         if there == 0:
             self._pass(copied)
             return None
@@ -112,6 +110,7 @@ class Tap:
         count = int(times[:there].searchsorted(begin + span_s - _EARLY)) + 1
         if count > there and not broken and copied < len(self._rows):
             return None
+        self._shift = shift  # not before: what is looked at again is not yet shifted
         if self._gate is None or count > there:
             count = there
         taken: Rows = rows[index[:count]]

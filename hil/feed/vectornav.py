@@ -134,7 +134,7 @@ def _opened(config: FeedConfig) -> tuple[Link, str]:
         if kind == "pty":
             terminal = PtyLink(Path(rest) if rest else None)
             return terminal, f"pty {terminal.url}"
-        opened = open_link(f"tcpin:{rest}" if kind == "tcp" else config.place)
+        opened = open_link(config.listens or config.place)
     except HilError as error:
         raise HilError(f"feed {config.name}: {error}") from error
     if isinstance(opened, Listener):

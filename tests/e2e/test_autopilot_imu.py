@@ -15,7 +15,9 @@ from drivers import driver_names
 from drivers.can.bus import open_port
 from drivers.can.frames import frames
 from drivers.logs.recording import RecordingWriter
+from drivers.mavlink.signing import EPOCH_S, TICKS
 from hil.bridge import Loop, LoopOrder, Outlets
+from hil.pytest_plugin import StartBridge
 from hil.scenario import Scenario
 from hil.source import FileSource
 from nav.rotation import euler_from_quaternion
@@ -27,9 +29,15 @@ pytestmark = pytest.mark.skipif(
 RATE_HZ, REST_S, TURN_S, TURN, START_DEG = 100, 2.0, 1.5, np.pi / 2.0, 30.0
 
 
-def send(address: tuple[str, int], done: threading.Event) -> None:
-    """A level vehicle that stands, turns to the right by `TURN` and stands, as an autopilot tells it, five times as fast."""
-    packer = mav.MAVLink(None, 7, 1)
+def send(address: tuple[str, int], done: threading.Event, key: bytes = b"") -> None:
+    """A level vehicle that stands, turns to the right by `TURN` and stands, as an autopilot tells it, five times as fast.
+
+    With a `key` it signs, and somebody else tells of a wild turn in its name.
+    """
+    packer, forger = mav.MAVLink(None, 7, 1), mav.MAVLink(None, 7, 1)
+    if key:
+        packer.signing.secret_key, packer.signing.sign_outgoing = key, True
+        packer.signing.timestamp = int((time.time() - EPOCH_S) * TICKS)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         for k in range(round(RATE_HZ * (2.0 * REST_S + TURN_S))):
             since = k / RATE_HZ - REST_S
@@ -44,8 +52,20 @@ def send(address: tuple[str, int], done: threading.Event) -> None:
             ):
                 sock.sendto(bytes(message.pack(packer)), address)
                 packer.seq = (packer.seq + 1) % 256
+            if key:
+                wild = mav.MAVLink_highres_imu_message(
+                    time_us + 1000, 0.0, 0.0, -9.81, *[20.0] * 3, *[0.0] * 7, 0b111111
+                )
+                sock.sendto(bytes(wild.pack(forger)), address)
             time.sleep(0.2 / RATE_HZ)
     done.set()
+
+
+def free_address() -> tuple[str, int]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        host, number = probe.getsockname()
+    return str(host), int(number)
 
 
 def finished(loop: Loop, outlets: Outlets) -> tuple[Any, dict[str, Any]]:
@@ -55,9 +75,7 @@ def finished(loop: Loop, outlets: Outlets) -> tuple[Any, dict[str, Any]]:
 
 
 def test_it_is_navigated_compared_and_replayed(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = probe.getsockname()
+    address = free_address()
     chosen = Scenario.model_validate(
         {
             "driver": "mavlink-imu",
@@ -92,3 +110,25 @@ def test_it_is_navigated_compared_and_replayed(tmp_path: Path) -> None:
         again.take(batch[:n])
     _, replayed = finished(again, again_outlets)
     assert replayed["navigation_digest"] == result["navigation_digest"]
+
+
+def test_a_run_with_a_key_navigates_by_the_signed_packets_alone(hil_bridge: StartBridge, tmp_path: Path) -> None:
+    """Somebody who speaks in the autopilot's name and has no key is refused, counted and told, in a run with its processes."""
+    key, address = tmp_path / "mavlink.key", free_address()
+    key.touch(0o600)
+    key.write_bytes(bytes(range(32)))
+    navigation = {"alignment": "level", "align_s": 1.0, "start": {"heading_deg": START_DEG}, "silence_s": 1.0}
+    bus = f"mavlink:udpin:127.0.0.1:{address[1]}?signing_key={key}"
+    bridge = hil_bridge(simulate_head=False, bus=bus, driver="mavlink-imu", navigation=navigation)
+    done, sent = threading.Event(), round(RATE_HZ * (2.0 * REST_S + TURN_S))
+    send(address, done, key.read_bytes())
+    deadline = time.monotonic() + 20.0
+    while bridge.session.outlets.stats["samples"] < sent - 1 and time.monotonic() < deadline:
+        assert bridge.session.running
+        time.sleep(0.05)
+    row, summary = bridge.state(), bridge.stop()
+    assert np.degrees(euler_from_quaternion(row["q_nb"])[0]) == pytest.approx(START_DEG + 90.0, abs=0.1)
+    assert summary["samples"] == sent - 1
+    assert summary["refused"] == {"unsigned": sent}
+    assert summary["problem"] == f"packets were refused: {sent} unsigned"
+    assert any("packets are refused: unsigned" in text for _, severity, text in bridge.events() if severity == "error")

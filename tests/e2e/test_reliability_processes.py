@@ -4,14 +4,17 @@ import contextlib
 import os
 import resource
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mav
 from rows import note, recorded
 
 from drivers.can.frames import frames
@@ -157,20 +160,57 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", folder], check=True)
 
 
+class Station:
+    """A ground station that reads STATUSTEXT, and the link to it."""
+
+    def __init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.settimeout(0.1)
+        self.link = f"udpout:127.0.0.1:{self._socket.getsockname()[1]}?only=HEARTBEAT"
+        self._parser = mav.MAVLink(None)
+        self._texts: dict[int, str] = {}
+        """By their numbers, as far as their pieces have come."""
+
+    def heard(self, text: str) -> bool:
+        """Whether a text of several pieces has come."""
+        with contextlib.suppress(TimeoutError):
+            for message in self._parser.parse_buffer(self._socket.recv(65536)) or []:
+                if message.get_type() == "STATUSTEXT":
+                    self._texts[message.id] = self._texts.get(message.id, "") + message.text
+        return text in self._texts.values()
+
+
+Stations = tuple[Station, Station]
+
+
+@pytest.fixture
+def stations() -> Stations:
+    return Station(), Station()
+
+
+def links_of(stations: Stations) -> dict[str, list[str]]:
+    return {"links": [station.link for station in stations]}
+
+
 def fly_over_a_full_disk(
-    bridge: Bridge, path: Path, full: contextlib.AbstractContextManager[None], injected: str
+    bridge: Bridge, path: Path, full: contextlib.AbstractContextManager[None], injected: str, stations: Stations
 ) -> None:
     problems = bridge.session.problems
     with full:
         began = time.monotonic()
         wait_for(lambda: bridge.session.running and bool(problems))
         told_s = time.monotonic() - began
+        for station in stations:
+            wait_for(partial(station.heard, problems[0]))
         kept, problem = recorded(path)
         assert not problem, "what was recorded before is whole while the disk is full"
         wait_for(recorder_has(bridge, bridge.session.outlets.control.recorded + 500))
     room = time.monotonic()
     wait_for(lambda: bridge.session.running and "room again" in problems[-1])
     back_s = time.monotonic() - room
+    for station in stations:
+        wait_for(partial(station.heard, problems[-1]))
     wait_for(recorder_has(bridge, bridge.session.outlets.control.recorded + 500))
     summary = bridge.stop()
     found, problem = recorded(path)
@@ -189,20 +229,20 @@ def fly_over_a_full_disk(
     note(number, "disk full", injected, f"`recorder.lost` {recorder['lost']}", told, back, lost)
 
 
-def test_a_disk_that_is_full_for_a_while(small_disk: Path, hil_bridge: StartBridge) -> None:
+def test_a_disk_that_is_full_for_a_while(small_disk: Path, hil_bridge: StartBridge, stations: Stations) -> None:
     path = small_disk / "run.dhil"
-    bridge = hil_bridge(record=path, **FLIGHT)
+    bridge = hil_bridge(record=path, mavlink=links_of(stations), **FLIGHT)
     wait_for(recorder_has(bridge, 1000))
-    fly_over_a_full_disk(bridge, path, filled(small_disk), "a disk of 16 MiB is filled, then there is room")
+    fly_over_a_full_disk(bridge, path, filled(small_disk), "a disk of 16 MiB is filled, then there is room", stations)
     path.unlink()
 
 
-def test_a_file_that_may_not_grow_for_a_while(hil_bridge: StartBridge, tmp_path: Path) -> None:
+def test_a_file_that_may_not_grow_for_a_while(hil_bridge: StartBridge, tmp_path: Path, stations: Stations) -> None:
     path = tmp_path / "run.dhil"
-    bridge = hil_bridge(record=path, **FLIGHT)
+    bridge = hil_bridge(record=path, mavlink=links_of(stations), **FLIGHT)
     wait_for(recorder_has(bridge, 1000))
     full = limited(pid_of(bridge, "recorder"), path.stat().st_size + 100)
-    fly_over_a_full_disk(bridge, path, full, LIMIT)
+    fly_over_a_full_disk(bridge, path, full, LIMIT, stations)
 
 
 def test_a_recording_cut_at_every_byte_of_its_last_block(tmp_path: Path) -> None:

@@ -1,12 +1,14 @@
 """The command line: what is refused and how, exit codes, what stands on which stream."""
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
+from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from commands import called
 from drivers.can.convert import to_message
 from drivers.can.dtg_head_emulator import HeadEncoder
 from drivers.can.frames import FrameArray
+from drivers.mavlink.commands import autopilot_version
 
 Cli = Callable[..., tuple[int, str, str]]
 HIL = (sys.executable, "-c", "from hil.cli import main; main()")
@@ -79,6 +82,38 @@ def test_commands_start_fast() -> None:
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
+@pytest.mark.parametrize(
+    ("bus", "mend"),
+    [
+        ("socketcan:", "expected INTERFACE:CHANNEL, as unix:dtg-hil or socketcan:vcan0"),
+        ("nonsense:x", "nobody knows an interface 'nonsense'; there is: "),
+        ("serial:", "expected INTERFACE:CHANNEL"),
+        ("serial:/dev/ttyUSB0", "expected serial:/dev/NAME:BAUD"),
+        ("serial:/dev/ttyUSB0:fast", "baud rate 'fast' is not a whole number"),
+        ("unix:a/b", "a bus name has 1 to 40 letters"),
+        ("socketcan:can0?filter=9", "expected ID:MASK"),
+        ("mavlink:pigeon:1:2", "unknown kind 'pigeon'"),
+        ("mavlink:udpin:127.0.0.1:70000", "port '70000' is not a whole number"),
+    ],
+)
+@pytest.mark.parametrize("command", ["run", "run FILE", "imu", "replay"])
+def test_a_malformed_bus_is_refused_before_anything_is_started(
+    hil: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, bus: str, mend: str
+) -> None:
+    """No kernel is prepared, no window opened, no process started: each of them would have said or left something."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.toml").write_text(f'bus = "{bus}"\n')
+    log, before = write_candump(tmp_path / "head.log", a_head(10)), set(os.listdir(tmp_path))
+    given = {"run FILE": ["run", "mine.toml"], "replay": ["replay", log, "--bus", bus]}
+    children = multiprocessing.active_children()
+    code, out, err = hil(*given.get(command, [command, "--bus", bus]))
+    assert (code, out) == (2, "")
+    assert mend in err
+    assert len(err.splitlines()) == 1, "nothing was said but the mend"
+    assert multiprocessing.active_children() == children
+    assert set(os.listdir(tmp_path)) == before
+
+
 BAD_TOML = "[navigation\nalign_s = 3"
 
 
@@ -110,7 +145,11 @@ BAD_TOML = "[navigation\nalign_s = 3"
         (["run", "--imu", "no-board"], "", "no driver 'no-board'; there is: dronecan-imu, dtg-head"),
         (["run", "--bus", "can0"], "", "bus 'can0': expected INTERFACE:CHANNEL"),
         (["run", "--bus", "unix:a b"], "", "a bus name has 1 to 40 letters"),
-        (["run", "--bus", "carrier-pigeon:1"], "", "bus carrier-pigeon:1: "),
+        (
+            ["run", "--bus", "carrier-pigeon:1"],
+            "",
+            "bus 'carrier-pigeon:1': nobody knows an interface 'carrier-pigeon'; there is",
+        ),
         (["run", "--mavlink", "pigeon:14550"], "", "pigeon:14550"),
         (["imu", "--bus", "can0"], "", "bus 'can0': expected INTERFACE:CHANNEL"),
         (["replay", "FILE.dhil"], "", "recording FILE.dhil: No such file or directory"),
@@ -301,10 +340,14 @@ def test_doctor(hil: Cli) -> None:
     assert any("CAN" in finding["what"] for finding in findings)
 
 
-def test_version(hil: Cli) -> None:
-    code, out, _ = hil("version")
-    assert code == 0
-    assert out.startswith("dtg-hil ")
+@pytest.mark.parametrize("asked", ["--version", "version"])
+def test_the_version_is_that_of_the_package_and_of_autopilot_version(hil: Cli, asked: str) -> None:
+    code, out, err = hil(asked)
+    assert (code, err) == (0, "")
+    name, version, _, number = out.replace(")", "").split()
+    assert (name, version) == ("dtg-hil", installed("dtg-hil"))
+    assert int(number, 16) == autopilot_version().flight_sw_version
+    assert [int(number, 16) >> shift & 255 for shift in (24, 16, 8)] == [int(part) for part in version.split(".")[:3]]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])

@@ -16,7 +16,12 @@ from serial.tools.list_ports_common import ListPortInfo
 
 from drivers import make_emulator
 from drivers.can.bus import open_port
+from drivers.can.interface import read_link
+from hil.doctor import judged
 from nav.increments import ImuIncrements
+
+ACTIVE = '[{"linkinfo": {"info_data": {"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 500000}}}}]'
+"""What ``ip -details -json link`` prints of an adapter at work, in short."""
 
 
 def findings(*arguments: str) -> list[dict[str, Any]]:
@@ -55,6 +60,42 @@ def test_each_extra_names_its_mend() -> None:
     assert json.loads(said) == [f"pip install 'dtg-hil[{extra}]'" for extra in extras.values()]
     for module, extra in extras.items():
         assert f'{extra} = ["{module}' in project
+
+
+@pytest.mark.parametrize(
+    ("state", "verdict", "says", "mend"),
+    [
+        ({"up": True, "mtu": 72}, "ok", "up, mtu 72, ERROR-ACTIVE, 500000 bit/s", ""),
+        ({"up": True, "mtu": 16}, "info", "classic CAN only: FD layouts need mtu 72", ""),
+        ({"up": False, "mtu": 16}, "lack", "classic CAN only: FD layouts need mtu 72", "sudo ip link set can3 up"),
+        ({"up": False, "mtu": 72}, "lack", "down, mtu 72", "sudo ip link set can3 up"),
+    ],
+)
+def test_classic_can_is_a_note_and_no_lack(state: dict[str, Any], verdict: str, says: str, mend: str) -> None:
+    found = judged("can3", read_link(ACTIVE), **state)
+    assert (found.verdict, found.mend) == (verdict, mend)
+    assert says in found.found
+
+
+def test_a_classic_interface_off_the_bus_is_a_lack() -> None:
+    found = judged("can3", read_link(ACTIVE.replace("ERROR-ACTIVE", "BUS-OFF")), up=True, mtu=16)
+    assert found.verdict == "lack"
+    assert "wiring" in found.mend
+
+
+@pytest.mark.socketcan
+def test_a_real_classic_interface_is_a_note() -> None:
+    if os.geteuid() != 0:
+        pytest.skip("making an interface needs root")
+    made = subprocess.run(["ip", "link", "add", "vcan8", "type", "vcan"], check=False, capture_output=True)
+    assert made.returncode == 0, made.stderr
+    try:
+        subprocess.run(["ip", "link", "set", "vcan8", "mtu", "16", "up"], check=True)
+        (found,) = named("vcan8")
+    finally:
+        subprocess.run(["ip", "link", "del", "vcan8"], check=True)
+    assert found["verdict"] == "info"
+    assert found["found"] == "up, mtu 16, classic CAN only: FD layouts need mtu 72"
 
 
 @pytest.mark.socketcan

@@ -1,5 +1,6 @@
 """Feeds in a whole run: simulated time waits for the autopilot, real time does not, and the user is told what is rounded away."""
 
+import ipaddress
 import os
 import signal
 import time
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from autopilots import ArduPilotAhrs, Px4, Sitl, on_terminal
 from commands import called
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from hil.feed.common import ACTUATORS
@@ -100,6 +101,29 @@ def test_the_death_of_a_feed_is_said_and_the_run_goes_on(hil_bridge: StartBridge
     assert summary["samples"] == 12000
 
 
+def test_a_stopped_feed_holds_simulated_time_and_it_is_said(hil_bridge: StartBridge) -> None:
+    """A feed that is stopped cannot give its autopilot up: the user has to know what the run waits for."""
+    bridge = hil_bridge(navigation=TRUTH, motion=MOVING, duration_s=12, paced=False, mavlink={"links": ()}, feed=[JSON])
+    sitl = Sitl(port(bridge.session.feed_places()[0]))
+    sitl.socket.settimeout(30.0)
+    sitl.frame()
+    process = bridge.session._parts["feed 0"].process
+    assert process.pid
+    os.kill(process.pid, signal.SIGSTOP)
+    deadline = time.monotonic() + 30.0
+    while not bridge.session.problems and time.monotonic() < deadline:
+        assert bridge.session.running
+        time.sleep(0.05)
+    (said,) = bridge.session.problems
+    assert said == "the feed 0 process does not answer: it is stopped or starved, and simulated time waits for it"
+    waiting = bridge.session.outlets.stats["samples"]
+    os.kill(process.pid, signal.SIGCONT)
+    sitl.frame()
+    os.kill(process.pid, signal.SIGKILL)  # nobody is waited for any more
+    summary = bridge.wait_end(60)
+    assert waiting < summary["samples"] == 12000
+
+
 def scaled(grade: str, rate_hz: float, rng: np.random.Generator) -> tuple[float, float]:
     """Deviation of mean rate (deg/s) and force (mg) over a period, of white noise that is drawn."""
     fine_s, count = 1e-4, round(1e4 / rate_hz)
@@ -132,6 +156,7 @@ def test_what_the_filter_is_told_of_the_sensor_counts() -> None:
     st.sampled_from([0.0, 0.004, 0.02]),
     st.booleans(),
 )
+@example([1, 1, 1, 2], 0.004, True)
 def test_a_tap_gives_every_solution_once(batches: list[int], span_s: float, restart: bool) -> None:
     """However they come, and where the sensor's clock begins anew: all of them, in times that rise, spans as long as asked."""
     ring, number = Ring(NAV_STATE, 1024, 0), 0
@@ -186,6 +211,26 @@ def test_a_wrong_feed_is_refused_with_what_was_expected(feed: dict[str, Any], to
     with pytest.raises(HilError, match=r"feed\.0") as refused:
         load(None).with_changes(feed=[feed])
     assert told in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("host", "beyond"),
+    [("0.0.0.0", ["ardupilot-json on udpin", "px4 on tcpin", "vectornav on tcpin"]), ("127.0.0.2", [])],
+)
+def test_feeds_that_other_machines_can_reach_are_said(host: str, beyond: list[str]) -> None:
+    """As of MAVLink links: before the run, and in the same words."""
+    feeds = (f"ardupilot-json:{host}:0", f"px4:{host}:0", f"vectornav:tcp:{host}:0", "vectornav:pty")
+    options = [part for feed in feeds for part in ("--feed", feed)]
+    code, _, err = called("run", "rest", "--duration", 0.1, "--mavlink", "none", "--no-dashboard", *options)
+    assert code == 0, err
+    told = [line for line in err.splitlines() if "other machines" in line]
+    assert told == [f"feed {one}:{host}:0 can be reached from other machines; nothing is signed" for one in beyond]
+
+
+@pytest.mark.parametrize("kind", ["ardupilot-json", "px4", "vectornav"])
+def test_a_feed_listens_to_this_machine_alone_unless_told_otherwise(kind: Any) -> None:
+    listens = FeedConfig(kind=kind).listens
+    assert not listens or ipaddress.ip_address(listens.split(":")[1]).is_loopback
 
 
 @pytest.mark.parametrize(

@@ -85,12 +85,14 @@ def test_a_normal_end_is_no_death(hil_bridge: StartBridge) -> None:
     assert LOOP_DIED[:40].encode() not in heard
 
 
-@pytest.mark.parametrize("reader", ["publisher", "recorder"])
+@pytest.mark.parametrize("reader", ["publisher", "recorder", "feed 0"])
 def test_a_reader_that_stops_is_noticed_and_not_waited_for(
     reader: str, hil_bridge: StartBridge, tmp_path: Path
 ) -> None:
     _, url = listener()
-    bridge = hil_bridge(navigation=TRUTH, head={"rate_hz": 200}, mavlink={"links": [url]}, record=tmp_path / "run.dhil")
+    feed = {"kind": "ardupilot-json", "address": "127.0.0.1:0"}
+    chosen: dict[str, Any] = {"head": {"rate_hz": 200}, "mavlink": {"links": [url]}, "feed": [feed]}
+    bridge = hil_bridge(navigation=TRUTH, record=tmp_path / "run.dhil", **chosen)
     bridge.wait_mode("navigate")
     session: Any = bridge.session
     until = time.monotonic() + 30.0

@@ -560,6 +560,15 @@ def test_frames_that_are_held_up_are_not_lost():
     assert numbers(out, "j1939-imu")[-1] == 59
 
 
+@pytest.mark.parametrize("name", ["j1939-imu@0x17", "j1939-imu@z-up", "j1939-imu@23,z-up", "dronecan-imu@7"])
+def test_an_emulated_board_is_the_one_that_its_driver_follows(name):
+    """Address and axes behind the ``@`` are those of the other end too: nothing is foreign, every rate has its sign."""
+    driver, truth = make_driver(name), smooth(60, 0.01)
+    imu = driver.decode(make_emulator(name, 10_000).samples(truth))
+    assert driver.counters.foreign == 0
+    np.testing.assert_allclose(imu.dtheta, truth.dtheta[-len(imu) :], atol=0.01 * math.radians(1.0 / 128.0))
+
+
 @pytest.mark.parametrize("option", ["254", "-1", "x", "1,2", "z-down"])
 def test_wrong_options_are_refused(option):
     with pytest.raises(HilError, match=f"j1939-imu@{option}: give a source address"):
@@ -569,6 +578,8 @@ def test_wrong_options_are_refused(option):
 def test_boards_without_options_and_unknown_ones():
     with pytest.raises(HilError, match="'sbg' takes no option"):
         make_driver("sbg@3")
+    with pytest.raises(HilError, match="'sbg' takes no option"):
+        make_emulator("sbg@3", 10_000)
     with pytest.raises(HilError, match=r"no emulator of 'gyrotron'.*dtg-head.*sbg"):
         make_emulator("gyrotron", 10_000)
     for name, period_us in (("sbg", 500), ("xsens-can", 1000), ("xsens-can", 2550), ("j1939-imu", 2500)):

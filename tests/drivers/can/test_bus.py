@@ -83,7 +83,7 @@ def test_missing_real_interface_says_its_bit_rates():
         ("socketcan:?fd=true", "expected INTERFACE:CHANNEL"),
         ("unix:x?fd=true", "takes no options"),
         ("unix:../x", "40 letters"),
-        ("telepathy:x", "knows no interface 'telepathy'"),
+        ("telepathy:x", "nobody knows an interface 'telepathy'"),
     ],
 )
 def test_bad_urls(url, say):

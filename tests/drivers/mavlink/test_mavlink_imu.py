@@ -1,8 +1,12 @@
 """Another autopilot's MAVLink as an IMU: bytes through the port and the driver, its attitude beside ours."""
 
+import contextlib
 import math
+import re
 import socket
 import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,9 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
-from drivers.can.bus import open_port
+from drivers.can.bus import check_url, open_port
 from drivers.can.frames import frames
 from drivers.mavlink.imu import mavlink_imu
+from drivers.mavlink.signing import EPOCH_S, TICKS
 from drivers.serial.chunks import to_chunks
 from hil.other_attitude import Estimator, OtherAttitude
 from nav.errors import HilError
@@ -139,6 +144,120 @@ def test_the_port_hands_the_bytes_over(kind: str) -> None:
         assert count == 101
         again.close()
     port.close()
+
+
+def signed_by(key: bytes) -> mav.MAVLink:
+    """A packer of the autopilot's that signs, at the present time."""
+    packer = mav.MAVLink(None, 7, 1)
+    packer.signing.secret_key, packer.signing.sign_outgoing, packer.signing.link_id = key, True, 1
+    packer.signing.timestamp = int((time.time() - EPOCH_S) * TICKS)
+    return packer
+
+
+KEY = bytes(range(32))
+
+
+@pytest.fixture
+def key_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A file that holds `KEY`, and no times of earlier tests."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    file = tmp_path / "mavlink.key"
+    file.touch(0o600)
+    file.write_text(KEY.hex())
+    return file
+
+
+@contextlib.contextmanager
+def heard_at(options: str) -> Iterator[tuple[Any, Any, Callable[[bytes], None]]]:
+    """An opened bus, its driver, and what sends a packet there and has it taken."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        number = sender.getsockname()[1]
+    with (
+        contextlib.closing(open_port(f"mavlink:udpin:127.0.0.1:{number}{options}")) as port,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        driver, batch = mavlink_imu(), frames(1024)
+
+        def tell(packet: bytes) -> None:
+            sender.sendto(packet, ("127.0.0.1", number))
+            driver.decode(batch[: port.receive(batch, 1.0)])
+
+        yield port, driver, tell
+
+
+def test_with_a_key_only_what_is_signed_with_it_goes_further(key_file: Path) -> None:
+    good, forger = signed_by(KEY), signed_by(KEY[::-1])
+    with heard_at(f"?signing_key={key_file}") as (port, driver, tell):
+        for k in range(20):
+            packet = bytes(highres(k).pack(good))
+            tell(packet)
+            tell(packet)  # a replay
+            tell(bytes(highres(k + 1000).pack(forger)))
+            tell(stream(highres(k + 2000)))
+            tell(stream(highres(k + 3000), force_mavlink1=True))
+            tell(packet[:20] + bytes([packet[20] ^ 1]) + packet[21:])
+        refused = {"replayed": 20, "wrong signature": 20, "unsigned": 40, "damaged": 20}
+        assert port.refused == refused
+        assert all(reason in port.trouble for reason in refused)
+        counters = driver.counters
+        assert (driver.board.identity()["system"], counters.foreign, counters.crc_errors, counters.lost) == (7, 0, 0, 0)
+        (sample,) = driver.decode(to_chunks(bytes(highres(20).pack(good)))).time
+        assert sample == pytest.approx(5.0 + 20 * STEP_S), "nothing of the others was navigated"
+    with heard_at(f"?signing_key={key_file}") as (port, driver, tell):
+        tell(packet)
+        assert port.refused == {"replayed": 1}, "an earlier run's packet"
+
+
+def test_without_a_key_signed_packets_are_taken_as_others_are(key_file: Path) -> None:
+    with heard_at("") as (port, driver, tell):
+        packer = signed_by(KEY)
+        for k in range(20):
+            tell(bytes(highres(k).pack(packer)))
+        assert driver.counters.samples == 19  # the first one has no step
+        assert (port.refused, port.trouble) == ({}, "")
+
+
+def test_a_signed_stream_that_is_cut_anywhere_is_whole_again(key_file: Path) -> None:
+    """Over TCP packets come in pieces, with others' bytes between them."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        number = probe.getsockname()[1]
+    packer, rng = signed_by(KEY), np.random.default_rng(5)
+    data = b"".join(bytes(highres(k).pack(packer)) + b"\xfd\x00noise"[: k % 8] for k in range(100))
+    driver, batch, taken = mavlink_imu(), frames(64), 0
+    with (
+        contextlib.closing(open_port(f"mavlink:tcpin:127.0.0.1:{number}?signing_key={key_file}")) as port,
+        socket.create_connection(("127.0.0.1", number)) as sender,
+    ):
+        while data:
+            size = int(rng.integers(1, 300))
+            sender.send(data[:size])
+            data = data[size:]
+            taken += len(driver.decode(batch[: port.receive(batch, 0.05)]))
+        deadline = time.monotonic() + 10.0
+        while taken < 99 and time.monotonic() < deadline:
+            taken += len(driver.decode(batch[: port.receive(batch, 0.05)]))
+    assert taken == 99
+
+
+@pytest.mark.parametrize(
+    ("options", "say"),
+    [
+        ("?sign=true", "unknown option 'sign'; expected signing_key=FILE"),
+        ("?signing_key=/nowhere/key", "signing key /nowhere/key: No such file"),
+    ],
+)
+def test_wrong_options_of_the_bus_are_refused(options: str, say: str) -> None:
+    with pytest.raises(HilError, match=re.escape(say)):
+        check_url(f"mavlink:udpin:127.0.0.1:14560{options}")
+
+
+def test_a_key_that_others_can_read_is_refused(key_file: Path) -> None:
+    key_file.chmod(0o644)
+    with pytest.raises(HilError, match="chmod 600") as refused:
+        check_url(f"mavlink:udpin:127.0.0.1:14560?signing_key={key_file}")
+    assert KEY.hex() not in str(refused.value)
 
 
 def test_the_other_attitude_is_compared_where_both_are() -> None:
