@@ -2,17 +2,15 @@
 
 import json
 import os
-import signal
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from hil import cli_version, cli_watch
+from hil import cli_files, cli_version, cli_watch
+from hil.cli_common import Json, RunFailed, StopSignal, report, say
 from nav.errors import HilError
 
 if TYPE_CHECKING:
@@ -32,11 +30,6 @@ app.command()(cli_watch.check_axes)
 app.command()(cli_watch.monitor)
 
 
-class RunFailed(HilError):
-    """The request was right and the run failed."""
-
-
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else.")]
 Bus = Annotated[str | None, typer.Option(help="Bus URL: unix:NAME, socketcan:vcan0, serial:/dev/ttyUSB0:921600, ...")]
 Duration = Annotated[float | None, typer.Option(min=0.0, help="Seconds of device time, then stop.")]
 Speed = Annotated[str, typer.Option(help="1: real time; max: simulated time, as fast as it goes.")]
@@ -118,7 +111,7 @@ def run(
     if chosen.receiver and not _paced(speed):
         raise HilError("--speed max has no time in which a receiver could speak: leave it or the receivers out")
     for warning in look_before(chosen):
-        _say(warning)
+        say(warning)
     order = LoopOrder(
         chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
         paced=_paced(speed),
@@ -152,10 +145,10 @@ def imu(
     stop = StopSignal()
     head = SimulatedHead(chosen)
     for lack in claim().lacking if realtime else ():
-        _say(lack)
-    _say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
+        say(lack)
+    say(f"head {chosen.head.serial} of scenario {chosen.name} at {chosen.head.rate_hz:g} Hz on {chosen.bus}")
     result = feed(head, chosen, paced=_paced(speed), cancelled=lambda: stop.wanted)
-    _report({"scenario": chosen.name, **result}, as_json=as_json)
+    report({"scenario": chosen.name, **result}, as_json=as_json)
 
 
 @app.command()
@@ -216,147 +209,15 @@ def replay(
         from hil.plot import plot_difference
 
         plot_difference(plot, order.reference, summary.pop("trace"), log.name)
-        _say(f"plot written to {plot}")
+        say(f"plot written to {plot}")
 
 
-@app.command()
-def navigate(
-    imu_file: Annotated[Path, typer.Argument(metavar="IMU.csv", help="Increments: .csv, .npz or .parquet.")],
-    init: Annotated[Path, typer.Option(help="TOML with the start.")],
-    out: Annotated[Path, typer.Option(help="Where the navigation goes: .csv, .npz or .parquet.")],
-    attitude: Annotated[str, typer.Option(help="Attitude method.")] = "two-sample",
-    mechanization: Annotated[str, typer.Option(help="Mechanization.")] = "geographic",
-    gravity: Annotated[str, typer.Option(help="Gravity model.")] = "normal",
-    aid: Annotated[Path | None, typer.Option(help="Measurements that aid: .csv, .npz or .parquet.")] = None,
-    smooth: Annotated[bool, typer.Option("--smooth", help="Use later measurements too; needs --aid.")] = False,
-    every: Annotated[float | None, typer.Option(min=0.0, help="Seconds between rows of the output.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Navigate logged increments offline."""
-    from hil.offline import IMU_HEADER, NAV_HEADER, read_init, thin
-    from hil.offline import navigate as navigate_rows
-    from hil.tables import read_table, write_table
-    from nav.strapdown import Strapdown
-
-    core = Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
-    if smooth and aid is None:
-        raise HilError("--smooth needs measurements: give --aid FILE")
-    table, (start, config) = read_table(imu_file, IMU_HEADER), read_init(init)
-    header: tuple[str, ...] = NAV_HEADER
-    extra: dict[str, Any] = {}
-    if aid is None:
-        began = time.perf_counter()
-        rows = navigate_rows(table, start, attitude, mechanization, gravity)
-    else:
-        from hil.aid_file import read_aiding
-        from hil.offline_aided import AIDED_HEADER, navigate_aided
-
-        if config is None:
-            raise HilError(f"{init}: --aid needs the table [filter] in it, with grade and attitude_sigma_deg")
-        measurements, header = read_aiding(aid), AIDED_HEADER
-        began = time.perf_counter()
-        rows, extra = navigate_aided(table, start, config, measurements, core, smoothed=smooth)
-    seconds = time.perf_counter() - began
-    if every:
-        rows = thin(rows, every)
-    write_table(out, header, rows)
-    final = dict(zip(header, rows[-1].tolist(), strict=True))
-    _report({"samples": len(table), "rows": len(rows), "seconds": seconds, "final": final, **extra}, as_json=as_json)
-
-
-@app.command()
-def decode(
-    driver: Annotated[str, typer.Argument(help="Name of the driver, as dtg-head.")],
-    file: Annotated[Path, typer.Argument(help="Recording of frames.")],
-) -> None:
-    """Decode recorded frames to JSON samples, one a line; the counters go to standard error."""
-    from hil.decoder import decode_file
-
-    lines, counters, problem = decode_file(driver, file)
-    try:
-        for line in lines:
-            sys.stdout.write(line)
-    except BrokenPipeError:
-        return
-    _say(json.dumps(counters()))
-    if problem():
-        raise RunFailed(problem())
-
-
-@app.command()
-def export(
-    file: Annotated[Path, typer.Argument(help="Recording of frames.")],
-    out: Annotated[Path, typer.Argument(help="Table: .csv, .npz or .parquet; or .mcap.")],
-    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
-    as_json: Json = False,
-) -> None:
-    """Write the samples of a recording as a table, a column a signal; or its navigation for Foxglove (.mcap)."""
-    import numpy as np
-
-    if out.suffix == ".mcap":
-        from hil.mcap_recorder import export_mcap
-
-        _report(export_mcap(file, imu, out), as_json=as_json)
-        return
-    from hil.samples import read_samples
-    from hil.tables import write_table
-
-    samples = read_samples(file, imu)
-    write_table(out, tuple(samples.columns), np.stack(list(samples.columns.values()), axis=1))
-    _report({"file": str(out), "samples": len(samples), "columns": list(samples.columns)}, as_json=as_json)
-    if samples.problem:
-        raise RunFailed(samples.problem)
-
-
-@app.command()
-def allan(
-    file: Annotated[Path, typer.Argument(help="Recording at rest, or a table as for `hil navigate`.")],
-    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
-    shortest: Annotated[
-        float, typer.Option("--from", min=0.0, help="Shortest time, s: above the lag of the rotors or of a filter.")
-    ] = 0.0,
-    plot: Annotated[Path | None, typer.Option(help="Plot the deviations to this file (.svg, .png).")] = None,
-    as_json: Json = False,
-) -> None:
-    """Allan deviation of a recording at rest, and the coefficients that it shows."""
-    from hil.console import show_deviations
-    from hil.plot import check_plot, plot_deviations
-    from hil.samples import coefficients, deviations, read_samples
-
-    if plot is not None:
-        check_plot(plot)
-    samples = read_samples(file, imu)
-    fits, count, period = deviations(samples, shortest)
-    if plot is not None:
-        plot_deviations(plot, fits, file.name)
-    rows = [{"axis": name, **coefficients(name, fit)} for name, fit in fits.items()]
-    if as_json:
-        _report({"file": str(file), "samples": count, "left_out": len(samples) - count, "rows": rows}, as_json=True)
-    else:
-        show_deviations(f"{file.name}: {count} samples, {count * period:.6g} s", rows, len(samples) - count)
-    if samples.problem:
-        raise RunFailed(samples.problem)
-
-
-@app.command()
-def clock(
-    file: Annotated[Path, typer.Argument(help="Recording of a live run.")],
-    imu: Annotated[str | None, typer.Option(help="Driver of the board; left out: that of the recording.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Plot arrivals, fit, bound and steps (.svg, .png).")] = None,
-    as_json: Json = False,
-) -> None:
-    """Compare the clock of a recorded board with the host's: offset, drift, bound, steps."""
-    from hil.clock_log import clock_log
-    from hil.plot import check_plot, plot_clock
-
-    if plot is not None:
-        check_plot(plot)
-    log = clock_log(file, imu)
-    if plot is not None:
-        plot_clock(plot, log, file.name)
-    _report({"file": str(file), **log.summary()}, as_json=as_json)
-    if log.problem:
-        raise RunFailed(log.problem)
+app.command()(cli_files.navigate)
+app.command()(cli_files.decode)
+app.command()(cli_files.export)
+app.command()(cli_files.allan)
+app.command()(cli_files.clock)
+app.command()(cli_files.calibrate)
 
 
 @app.command()
@@ -373,83 +234,7 @@ def record(
 
     stop = StopSignal()
     chosen = load(scenario).with_changes(bus=bus)
-    _report(record_bus(chosen, file, duration, lambda: stop.wanted, _say), as_json=as_json)
-
-
-@app.command()
-def calibrate(
-    recordings: Annotated[list[Path] | None, typer.Argument(help="Recordings of positions and turns.")] = None,
-    out: Annotated[Path | None, typer.Option(help="The calibration file; with --simulate a folder.")] = None,
-    sequence: Annotated[Path | None, typer.Option(help="TOML that says what was done in the recordings.")] = None,
-    simulate: Annotated[
-        str | None, typer.Option(metavar="SCENARIO", help="Make recordings with the simulated head of a scenario.")
-    ] = None,
-    scenario: Annotated[str | None, typer.Option(help="Scenario with rotors and layout of the head.")] = None,
-    date: Annotated[str | None, typer.Option(help="YYYY-MM-DD; left out: that of the recordings.")] = None,
-    base: Annotated[
-        Path | None, typer.Option(help="Calibration of the head, where the recording is of a magnetometer alone.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
-    """Fit the calibration of a head to recordings of positions at rest and of turns, and of a magnetometer turned about."""
-    if out is None:
-        raise HilError("--out is missing: the calibration file, or with --simulate the folder")
-    if simulate is not None:
-        if recordings or sequence or scenario or date or base:
-            raise HilError("--simulate makes the recordings: give nothing but --out beside it")
-        from hil.calibration_sequence import SEQUENCE
-        from hil.calibration_sequence import simulate as make
-        from hil.scenario import load
-
-        made = make(load(simulate), out, _say)
-        _report({"recordings": len(made), "sequence": str(out / SEQUENCE)}, as_json=as_json)
-        return
-    if not recordings or sequence is None:
-        raise HilError("give recordings and --sequence, or --simulate SCENARIO to make them")
-    _calibrate(recordings, sequence, out, scenario, date, base, as_json=as_json)
-
-
-def _calibrate(
-    recordings: list[Path],
-    sequence: Path,
-    out: Path,
-    scenario: str | None,
-    date: str | None,
-    base: Path | None,
-    *,
-    as_json: bool,
-) -> None:
-    import datetime
-
-    from hil.calibrate import calibrate as fit_recordings
-    from hil.calibrate import rows
-    from hil.calibration import read, write
-
-    try:
-        day = None if date is None else datetime.date.fromisoformat(date)
-    except ValueError as error:
-        raise HilError(f"--date {date}: expected YYYY-MM-DD") from error
-    file = fit_recordings(recordings, sequence, scenario, day, _say, None if base is None else read(base))
-    write(out, file)
-    if as_json:
-        residual = None if file.residual is None else file.residual.model_dump()
-        print(
-            json.dumps(
-                {
-                    "file": str(out),
-                    "serial": file.serial,
-                    "date": file.date.isoformat(),
-                    "rows": rows(file),
-                    "undetermined": file.undetermined,
-                    "residual": residual,
-                }
-            )
-        )
-        return
-    from hil.console import print_calibration
-
-    print_calibration(file, rows(file))
-    _say(f"calibration written to {out}")
+    report(record_bus(chosen, file, duration, lambda: stop.wanted, say), as_json=as_json)
 
 
 @app.command()
@@ -464,7 +249,7 @@ def configure(
     """Make a board on a serial port send what its driver wants; the board forgets it when it is switched off."""
     from drivers.serial.setup import set_up
 
-    _report(set_up(driver, bus, rate), as_json=as_json)
+    report(set_up(driver, bus, rate), as_json=as_json)
 
 
 @app.command()
@@ -532,7 +317,7 @@ def bench(
     from hil.bench import measure
     from hil.bench.live import rows as live_rows
 
-    rows = live_rows(_say, seconds) if live else measure(_say)
+    rows = live_rows(say, seconds) if live else measure(say)
     if as_json:
         print(json.dumps({"rows": rows}))
         return
@@ -563,7 +348,7 @@ class _Screen(NamedTuple):
             raise HilError("--dashboard and --no-dashboard exclude each other")
         if self.off or (self.address is None and (self.tui or not paced)):
             return None
-        return open_window(self.address, _say)
+        return open_window(self.address, say)
 
 
 def _run(
@@ -596,7 +381,7 @@ def _run(
             view.show_compiling()
             time.sleep(0.1)
         for place in session.feed_places():
-            _say(f"an autopilot finds its feed at {place}")
+            say(f"an autopilot finds its feed at {place}")
         try:
             _follow(session, stop, view)
         except HilError as error:
@@ -630,24 +415,6 @@ def _follow(session: "Session", stop: "StopSignal", view: Any) -> None:
         session.wait(0.1)
 
 
-class StopSignal:
-    """Ctrl-C or SIGTERM asks for a clean stop; a second one ends at once."""
-
-    def __init__(self) -> None:
-        self.wanted = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._take)
-
-    def call(self) -> None:
-        """Ask for it."""
-        self.wanted = True
-
-    def _take(self, _number: int, _frame: FrameType | None) -> None:
-        if self.wanted:
-            raise SystemExit(130)
-        self.wanted = True
-
-
 def _paced(speed: str) -> bool:
     if speed not in {"1", "max"}:
         raise HilError(f"--speed {speed}: expected 1 or max")
@@ -659,7 +426,7 @@ def _links(scenario: "Scenario", key: Path | None, tlog: Path | None) -> "Scenar
 
     chosen = with_mavlink(scenario, key, tlog)
     for line in open_doors(chosen):
-        _say(line)
+        say(line)
     return chosen
 
 
@@ -688,23 +455,11 @@ def _outage(text: str) -> dict[str, Any]:
     return dict(zip(("kind", "start_s", "end_s"), parts, strict=True))
 
 
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
-
-
-def _report(result: dict[str, Any], *, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(result))
-        return
-    for key, value in result.items():
-        print(f"{key}: {value}")
-
-
 def main() -> None:
     """Entry point."""
     try:
         app()
     except HilError as error:
         for line in str(error).splitlines():
-            _say(f"hil: {line}")
+            say(f"hil: {line}")
         raise SystemExit(1 if isinstance(error, RunFailed) else 2) from None

@@ -1,19 +1,18 @@
 """The commands that look at a board without navigating: `hil check-axes`, `hil monitor`."""
 
 import json
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hil.cli_common import Json, RunFailed, StopSignal, say
 from nav.errors import HilError
 
 File = Annotated[Path | None, typer.Argument(help="A recording or flight log; left out: the bus.")]
 Bus = Annotated[str | None, typer.Option(help="Bus URL: unix:NAME, socketcan:can0, serial:/dev/ttyUSB0:921600, ...")]
 Imu = Annotated[str | None, typer.Option(help="Driver of the board.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else.")]
 
 
 def check_axes(
@@ -25,7 +24,6 @@ def check_axes(
 ) -> None:
     """Say which axis of a board looks swapped or has the wrong sign, and the head.axes that put it right."""
     from hil.axes_check import AxesCheck, guide, of_bus, of_recording
-    from hil.cli import RunFailed, StopSignal
 
     _one_source(file, bus)
     check = AxesCheck()
@@ -37,11 +35,11 @@ def check_axes(
             raise HilError("--imu is missing: the driver of the board (hil monitor finds it)")
         stop = StopSignal()
         try:
-            guide(check, of_bus(bus or "", imu, scenario, lambda: stop.wanted), _say, time.monotonic)
+            guide(check, of_bus(bus or "", imu, scenario, lambda: stop.wanted), say, time.monotonic)
         except HilError as late:
             if not check.postures.found:
                 raise RunFailed(str(late)) from late
-            _say(str(late))
+            say(str(late))
     found = check.report()
     if as_json:
         print(json.dumps(found))
@@ -80,15 +78,13 @@ def monitor(
     databases = [load_database(path) for path in dbc or ()]
     for path, database in zip(dbc or (), databases, strict=True):
         for name, reason in database.refused.items():
-            _say(f"{path}: {name} is left out: {reason}")
+            say(f"{path}: {name} is left out: {reason}")
     if bus is not None and (hint := look_first(bus, imu)):
-        _say(hint)
+        say(hint)
     watched = Monitor(imu, databases, bitrates_of(bus, bitrate, data_bitrate))
     if file is not None:
         report = watch_file(watched, file, imu) | {"source": str(file)}
     else:
-        from hil.cli import StopSignal
-
         stop = StopSignal()
         report = watch_bus(watched, str(bus), duration, lambda: stop.wanted, quiet=as_json) | {"source": bus}
     if as_json:
@@ -99,15 +95,11 @@ def monitor(
     MonitorView().end(report)
     if report["driver"] is not None and imu is None:
         where = f" --bus {bus}" if bus is not None else ""
-        _say(f"the board is understood by {report['driver']}: hil run --imu {report['driver']}{where}")
+        say(f"the board is understood by {report['driver']}: hil run --imu {report['driver']}{where}")
     if report["problem"]:
-        _say(report["problem"])
+        say(report["problem"])
 
 
 def _one_source(file: Path | None, bus: str | None) -> None:
     if (file is None) == (bus is None):
         raise HilError("give a recording, or --bus URL, and not both")
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)

@@ -209,7 +209,7 @@ class _Publisher:
         next_s = self._poll(now_s)
         if now_s - self._heard_s > _READ_S:  # behind what is due: that may not wait
             self._heard_s = now_s
-            self._hear()
+            self._follow()
         if self._links is not None and now_s - self._told_s > _TELL_S:
             self._told_s = now_s
             self._links.tell(self._hub.tallies())
@@ -247,8 +247,8 @@ class _Publisher:
             self._silent = True
             self._station.silence()
 
-    def _hear(self) -> None:
-        """Have told what else the loop says."""
+    def _follow(self) -> None:
+        """Take over what else the loop says."""
         self._station.set_loss(self._control.lost, self._control.samples)
         if self._stats is not None:
             self._station.set_clock(clock_reading(self._stats))

@@ -72,7 +72,7 @@ def open_port(url: str, *, listen: bool = True, lossless: bool = False) -> Port:
     if interface == "pty":
         from drivers.serial.pty import PtyPort
 
-        return PtyPort(Path(rest))
+        return PtyPort(Path(channel))
     if interface == "mavlink":
         from drivers.mavlink.port import MavlinkPort
 
@@ -107,8 +107,8 @@ def check_url(url: str) -> None:
         from drivers.mavlink.port import input_of
 
         input_of(url.partition(":")[2])
-    elif interface not in can.VALID_INTERFACES:
-        known = ", ".join(sorted({"serial", "mavlink", *can.VALID_INTERFACES}))
+    elif interface not in {"pty", *can.VALID_INTERFACES}:
+        known = ", ".join(sorted({"serial", "pty", "mavlink", *can.VALID_INTERFACES}))
         raise HilError(f"bus {url!r}: nobody knows an interface {interface!r}; there is: {known}")
     elif interface == "socketcan" and "filter" in words:
         parse_filters(words["filter"])

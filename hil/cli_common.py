@@ -1,0 +1,49 @@
+"""What the commands share: how they answer, how they are stopped, how they fail."""
+
+import json
+import signal
+import sys
+from types import FrameType
+from typing import Annotated, Any
+
+import typer
+
+from nav.errors import HilError
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else.")]
+
+
+class RunFailed(HilError):
+    """The request was right and the run failed."""
+
+
+class StopSignal:
+    """Ctrl-C or SIGTERM asks for a clean stop; a second one ends at once."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._take)
+
+    def call(self) -> None:
+        """Ask for it."""
+        self.wanted = True
+
+    def _take(self, _number: int, _frame: FrameType | None) -> None:
+        if self.wanted:
+            raise SystemExit(130)
+        self.wanted = True
+
+
+def say(text: str) -> None:
+    """Tell the user, beside what is printed."""
+    print(text, file=sys.stderr)
+
+
+def report(result: dict[str, Any], *, as_json: bool) -> None:
+    """Print the answer, as one JSON object or a line for each of its keys."""
+    if as_json:
+        print(json.dumps(result))
+        return
+    for key, value in result.items():
+        print(f"{key}: {value}")
