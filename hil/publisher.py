@@ -172,6 +172,8 @@ class _Publisher:
                 if self._control.loop_pid:
                     self._say_died()
             if stop in ready or (report in ready and not self._hear(report)):
+                self._follow()
+                self._poll(time.monotonic())
                 return
             next_s = self._step(self._wake in ready)
 
@@ -207,14 +209,16 @@ class _Publisher:
         if called or now_s - self._read_s > _READ_S:
             self._read(now_s)
         next_s = self._poll(now_s)
-        if now_s - self._heard_s > _READ_S:  # behind what is due: that may not wait
+        if now_s - self._heard_s > _READ_S or self._events.count != self._event_number:
             self._heard_s = now_s
-            self._follow()
+            self._follow()  # behind what is due: that may not wait
+            next_s = self._poll(now_s)
         if self._links is not None and now_s - self._told_s > _TELL_S:
             self._told_s = now_s
             self._links.tell(self._hub.tallies())
         slow = self._ring.count - self._seen == 1  # do not wait for its next solution
         if self._hungry() and (slow or (self._looks and self._look())):
+            now_s = time.monotonic()
             self._read(now_s)
             next_s = self._poll(now_s)
         self._watch(self._hungry())

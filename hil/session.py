@@ -8,6 +8,7 @@ Each box is a process of its own. The session notices a process that dies, and s
 
 import contextlib
 import multiprocessing as mp
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -190,7 +191,8 @@ class Session:
             self._window.socket.close()  # the port lives as long as its process
         if self._publish and scenario.mavlink.links:
             network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
-            shared = outlets.stats, outlets.fixes, self.links, self.order.realtime and self.order.live
+            looks = self.order.realtime and self.order.live and len(os.sched_getaffinity(0)) > 1
+            shared = outlets.stats, outlets.fixes, self.links, looks
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)
         self.feeds.launch(launch, outlets.states, 1, outlets.control)

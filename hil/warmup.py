@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 STEPS = 5
 """Steps that each of the two functions here reports."""
+ALONE = 6
+"""Frames of a batch that are taken one by one: a sample at least."""
 Report = Callable[[int], None]
 
 
@@ -91,7 +93,9 @@ def warm_loop(scenario: Scenario, report: Report) -> None:
         for _, slow, batch in chunks:
             if len(slow):
                 loop.take(slow)
-            loop.take(batch)
+            loop.take(batch[:-ALONE])
+            for k in range(len(batch))[-ALONE:]:  # as they come in real time
+                loop.take(batch[k : k + 1])
             _aid(loop, outlets.states)
             report(3)
     outlets.states.latest(np.zeros(1, NAV_STATE))

@@ -4,14 +4,13 @@ At a thousand samples a second nearly all are of this kind. What is not goes the
 last bit.
 """
 
-import math
 from typing import Any
 
 import numpy as np
 from numba import carray
 from numpy.typing import NDArray
 
-from nav.increments import FloatArray, IntArray
+from nav.increments import FloatArray, IntArray, first_bad
 from nav.kernel import float_pointer, kernel
 from nav.step import DONE, SOLUTION_PART, push
 
@@ -34,7 +33,9 @@ def take_one(
     rate: FloatArray,
     force: FloatArray,
 ) -> bool:
-    """Take the first sample; False, and nothing has changed, when it is not an ordinary one.
+    """Take the only sample; False, and nothing has changed, when it is not an ordinary one.
+
+    False as well where it is so large that the solution is no number any more: the way of batches says so too.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def take_one(
     """
     number, flags, mask = expected
     t = step[0]
-    if sequence[0] != number or validity[0] & mask != flags or not t > 0.0 or not math.isfinite(time[0]):
+    if sequence[0] != number or validity[0] & mask != flags or not t > 0.0 or first_bad(time, step, dtheta, dvel) >= 0:
         return False
     x, y, z = dtheta[0, 0] - gyro_bias[0] * t, dtheta[0, 1] - gyro_bias[1] * t, dtheta[0, 2] - gyro_bias[2] * t
     if push(core, t, x, y, z, dvel[0, 0], dvel[0, 1], dvel[0, 2]) != DONE:

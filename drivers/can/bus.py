@@ -107,6 +107,8 @@ def check_url(url: str) -> None:
         from drivers.mavlink.port import input_of
 
         input_of(url.partition(":")[2])
+    elif interface == "pty" and "?" in url:
+        raise HilError(f"bus {url!r}: pty: takes no options")
     elif interface not in {"pty", *can.VALID_INTERFACES}:
         known = ", ".join(sorted({"serial", "pty", "mavlink", *can.VALID_INTERFACES}))
         raise HilError(f"bus {url!r}: nobody knows an interface {interface!r}; there is: {known}")

@@ -40,7 +40,8 @@ def vectornav_board(period_us: int) -> SerialEmulator:
 
 def mip_board(period_us: int) -> SerialEmulator:
     """A 3DM of MicroStrain; its base rate is 1000 Hz."""
-    check_period("a MicroStrain board", period_us, least_us=MipEmulator.base_hz, grid_us=MipEmulator.base_hz)
+    base_us = 1_000_000 // MipEmulator.base_hz
+    check_period("a MicroStrain board", period_us, least_us=base_us, grid_us=base_us)
     return SerialEmulator(MipEmulator().packets)
 
 

@@ -7,8 +7,8 @@ nothing (none, or many packets in one read at the start) leave it a gap.
 
 SETTLED_NS = 1_000_000_000
 """The fastest arrival is known when none was faster, by half a sample, for so long."""
-LEAST_NS = 5_000_000
-"""A smaller step is taken for a gap: some arrivals are faster than ever by so much."""
+LEAST_NS = 300_000_000
+"""A smaller step is taken for a gap, which is bridged and counted: no adapter holds bytes up for so long."""
 DRIFT = 2000
 """What was the fastest fades by one part in so many of the time: either clock may drift."""
 

@@ -114,7 +114,10 @@ class PtyPort:
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """See `drivers.can.bus.Port.receive`."""
-        if self._link is None or not select.select([self._link], [], [], timeout)[0]:
+        if self._link is None:
+            time.sleep(timeout)
+            return 0
+        if not select.select([self._link], [], [], timeout)[0]:
             return 0
         return fill_chunks(batch, self._link.receive(), time.time_ns())
 

@@ -19,6 +19,8 @@ class SerialLedger(Ledger):
     """The board counts its samples."""
     unsaid: int = 0
     """Samples at the start that only set the clock: of a board that does not say the length of a step."""
+    seem_lost: int = 0
+    """Samples that seem to be missing where the clock was set ahead a little."""
 
     @classmethod
     def of(cls, driver: str, period_us: int) -> "SerialLedger":
@@ -36,10 +38,13 @@ class SerialLedger(Ledger):
         elif elapsed <= 0:
             self.restarts += 1
             self.samples -= 1  # it is set aside until the next one continues it
-        else:
-            self.clock_steps += jump > max((by_clock - 1) * self.period_us // 2, LEAST_NS // 1000) and by_clock > 1
+        elif by_clock > 1 and jump > max((by_clock - 1) * self.period_us // 2, LEAST_NS // 1000):
+            self.clock_steps += 1
+        else:  # taken for a gap
+            self.seem_lost += by_clock - steps
 
     def as_dict(self) -> dict[str, int]:
         """Name to count; `skipped_bytes` is in `head` of the summary."""
-        names = ("lost", "late", "duplicated", "frozen", "clock_steps", "restarts", "skipped_bytes")
-        return {"samples": max(self.samples - self.unsaid, 0), **{name: getattr(self, name) for name in names}}
+        names = ("late", "duplicated", "frozen", "clock_steps", "restarts", "skipped_bytes")
+        found = {name: getattr(self, name) for name in names}
+        return {"samples": max(self.samples - self.unsaid, 0), **found, "lost": self.lost + self.seem_lost}

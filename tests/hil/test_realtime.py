@@ -205,6 +205,16 @@ def test_a_loop_that_looks_for_samples_rests_when_none_come(hil_bridge: StartBri
     bridge.wait_end(30)
 
 
+@pytest.mark.parametrize("layout", ["fd", "classic"])
+def test_what_takes_a_sample_alone_is_ready_before_the_first(layout: str) -> None:
+    asks = (
+        "from hil.scenario import load; from hil.warmup import warm_loop; from nav.ordinary import take_one\n"
+        f"warm_loop(load(None).with_changes(head={{'layout': {layout!r}}}), lambda done: None)\n"
+        "assert take_one.signatures"
+    )
+    subprocess.run([sys.executable, "-c", asks], check=True, timeout=300)
+
+
 @pytest.mark.parametrize("period_s", [None, 1e-4, 4.9e-4])
 def test_looking_does_not_pay_before_the_period_is_known_or_where_there_is_no_rest(period_s: float | None) -> None:
     assert rest(period_s) == 0
