@@ -6,7 +6,8 @@ nothing (none, or many packets in one read at the start) leave it a gap.
 """
 
 SETTLED_NS = 1_000_000_000
-"""The fastest arrival is known when none was faster, by half a sample, for so long."""
+"""The fastest arrival is known when none was faster, by `FASTER_NS`, for so long."""
+FASTER_NS = 30_000_000
 LEAST_NS = 300_000_000
 """A smaller step is taken for a gap, which is bridged and counted: no adapter holds bytes up for so long."""
 DRIFT = 2000
@@ -21,10 +22,10 @@ class Lead:
         self._at: int | None = None
         self._risen = 0
 
-    def note(self, time_ns: int, arrival_ns: int, period_ns: int) -> None:
+    def note(self, time_ns: int, arrival_ns: int) -> None:
         """Take the sample that ended at `time_ns` and came at `arrival_ns`."""
         lead = time_ns - arrival_ns
-        if self._at is None or lead > self._most + period_ns // 2:
+        if self._at is None or lead > self._most + FASTER_NS:
             self._risen = time_ns
         self._most = lead if self._at is None else max(lead, self._most - (time_ns - self._at) // DRIFT)
         self._at = time_ns

@@ -85,7 +85,7 @@ class Timeline:
         self._counters.lost += steps - 1
         if steps == 1 or not self.period_ns:
             self.period_ns = said_ns or elapsed // steps
-        self._lead.note(self.time_ns, arrival_ns, self.period_ns)
+        self._lead.note(self.time_ns, arrival_ns)
         return said_ns or (elapsed if steps == 1 else self.period_ns)
 
     def _elapsed(self, time_ns: int, since: int) -> int:
