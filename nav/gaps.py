@@ -18,9 +18,10 @@ MAX_FILL = 4096
 
 
 @kernel
-def _rates(
+def rates(
     step: FloatArray, dtheta: FloatArray, dvel: FloatArray, row: int, rate: FloatArray, force: FloatArray
 ) -> None:
+    """Rate and force of a sample."""
     while row >= 0 and step[row] <= 0.0:  # a sample without length has no rate: the one before it counts
         row -= 1
     if row >= 0:
@@ -103,7 +104,7 @@ class GapFiller:
         return result, gaps
 
     def _keep(self, imu: ImuIncrements, row: int) -> None:
-        _rates(imu.step, imu.dtheta, imu.dvel, row, self.rate, self.force)
+        rates(imu.step, imu.dtheta, imu.dvel, row, self.rate, self.force)
 
     def _filled(self, imu: ImuIncrements, jumps: np.ndarray) -> tuple[ImuIncrements, list[Gap]]:
         parts: list[ImuIncrements] = []

@@ -311,10 +311,10 @@ class Navigator:
         core, filler, health = self._core, self._filler, int(self.health)
         if not self._plain or not core.address or self.mode < Mode.NAVIGATE or health & _SILENT:
             return False
-        expected, what = (filler.expected, self._flagged, _FLAGS), (int(self.mode), health)
+        expected, what = (filler.expected, self._flagged, _FLAGS), (int(self.mode), health, 1.0)
         sample = imu.time, imu.step, imu.dtheta, imu.dvel, imu.validity, imu.sequence
         out = self._solutions.buffer, filler.rate, filler.force
-        if not take_one(core.address, expected, what, *sample, self.gyro_bias, *out):
+        if not take_one(core.address, expected, what, *sample, self.gyro_bias, *self._worthless, *out):
             return False
         filler.passed(expected[0], float(imu.time[0]))
         self._state[:] = core.solution

@@ -10,8 +10,10 @@ import numpy as np
 from numba import carray
 from numpy.typing import NDArray
 
+from nav.gaps import rates
 from nav.increments import FloatArray, IntArray, first_bad
 from nav.kernel import float_pointer, kernel
+from nav.solutions import add_to_rows, fill_rows
 from nav.step import DONE, SOLUTION_PART, push
 
 _SOLUTION = 8 * SOLUTION_PART.start
@@ -21,7 +23,7 @@ _SOLUTION = 8 * SOLUTION_PART.start
 def take_one(
     core: int,
     expected: tuple[int, int, int],
-    what: tuple[int, int],
+    what: tuple[int, int, float],
     time: FloatArray,
     step: FloatArray,
     dtheta: FloatArray,
@@ -29,6 +31,8 @@ def take_one(
     validity: IntArray,
     sequence: IntArray,
     gyro_bias: FloatArray,
+    sigma: NDArray[np.float32],
+    ratio: NDArray[np.float32],
     rows: NDArray[Any],
     rate: FloatArray,
     force: FloatArray,
@@ -44,11 +48,13 @@ def take_one(
     expected : tuple
         Sequence number, flags, and which flags count.
     what : tuple
-        Mode, health.
+        Mode, health, progress.
     time, step, dtheta, dvel, validity, sequence
         Of :class:`nav.increments.ImuIncrements`.
     gyro_bias : (3,) float
         rad/s.
+    sigma, ratio : (9,), (len(Ratio),) float32
+        What the solution is worth.
     rows : (2 or more,) array of NAV_STATE
         Out: the solution, in row 1 and again in row 0.
     rate, force : (3,) float
@@ -61,20 +67,11 @@ def take_one(
     x, y, z = dtheta[0, 0] - gyro_bias[0] * t, dtheta[0, 1] - gyro_bias[1] * t, dtheta[0, 2] - gyro_bias[2] * t
     if push(core, t, x, y, z, dvel[0, 0], dvel[0, 1], dvel[0, 2]) != DONE:
         return False
-    solution = carray(float_pointer(core + _SOLUTION), 10)
-    row = rows[1]
-    row.time, row.sequence, row.progress = time[0], sequence[0], 1.0
-    row.mode, row.health = what
-    row.lat, row.lon, row.height = solution[0], solution[1], solution[2]
-    for i in range(3):
-        rate[i], force[i] = dtheta[0, i] / t, dvel[0, i] / t
-        row.vel_n[i], row.gyro_bias[i] = solution[3 + i], gyro_bias[i]
-        row.w_ib_b[i], row.f_b[i] = rate[i] - gyro_bias[i], force[i]
-    for i in range(4):
-        row.q_nb[i] = solution[6 + i]
-    for i in range(9):
-        row.sigma[i] = np.inf
-    for i in range(5):
-        row.test_ratio[i] = 0.0
-    rows[0] = row
+    position = carray(float_pointer(core + _SOLUTION), (1, 3))
+    velocity = carray(float_pointer(core + _SOLUTION + 24), (1, 3))
+    attitude = carray(float_pointer(core + _SOLUTION + 48), (1, 4))
+    fill_rows(rows, 1, 2, what, position, velocity, attitude, gyro_bias, sigma, ratio)
+    add_to_rows(rows, time, step, dtheta, dvel, sequence)
+    rates(step, dtheta, dvel, 0, rate, force)
+    rows[0] = rows[1]
     return True

@@ -15,7 +15,7 @@ StateArray = NDArray[Any]
 
 
 @kernel
-def _fill(
+def fill_rows(
     rows: StateArray,
     start: int,
     stop: int,
@@ -27,6 +27,7 @@ def _fill(
     sigmas: NDArray[np.float32],
     ratios: NDArray[np.float32],
 ) -> None:
+    """`Solutions.fill`; `start` and `stop` are those of the buffer."""
     for k in range(start, stop):
         i, row = min(k - start, position.shape[0] - 1), rows[k]
         row.mode, row.health, row.progress = what
@@ -42,9 +43,10 @@ def _fill(
 
 
 @kernel
-def _add_samples(
+def add_to_rows(
     rows: StateArray, time: FloatArray, step: FloatArray, dtheta: FloatArray, dvel: FloatArray, sequence: IntArray
 ) -> None:
+    """`Solutions.add_samples`, to the rows from the second on."""
     for i in range(time.shape[0]):
         row = rows[i + 1]
         row.time, row.sequence = time[i], sequence[i]
@@ -107,11 +109,11 @@ class Solutions:
         worth : tuple of (9,), (len(Ratio),) float32
             Sigmas and test ratios.
         """
-        _fill(self._rows, start + 1, stop + 1, what, *answers, gyro_bias, *worth)
+        fill_rows(self._rows, start + 1, stop + 1, what, *answers, gyro_bias, *worth)
 
     def add_samples(self, imu: ImuIncrements) -> None:
         """Time, number, rate and force of every row, from samples from which the bias is not taken off yet."""
-        _add_samples(self._rows, imu.time, imu.step, imu.dtheta, imu.dvel, imu.sequence)
+        add_to_rows(self._rows, imu.time, imu.step, imu.dtheta, imu.dvel, imu.sequence)
 
     def keep_last(self, n: int) -> None:
         """The last of `n` rows is what `last` gives."""

@@ -26,6 +26,8 @@ PROTOCOL = 1
 """Version of the message set."""
 FIRST_ID, RESERVED_IDS = 0x150, 16
 """The identifiers that are reserved for aiding."""
+_BLOCK = 0xFFFFFFFF - (RESERVED_IDS - 1)
+"""What of an identifier says that it is one of them."""
 _COMMON = ("crc16", "e2e_counter", "protocol", "source", "device_time")
 _TURN_US = 1 << 32
 
@@ -65,7 +67,7 @@ def _messages() -> dict[Kind, _Message]:
 
 def is_aiding(can_ids: NDArray[np.uint32]) -> NDArray[np.bool_]:
     """Whether each identifier (with its flags) is one of those reserved for aiding."""
-    found: NDArray[np.bool_] = (can_ids & np.uint32(0xFFFFFFFF - (RESERVED_IDS - 1))) == FIRST_ID
+    found: NDArray[np.bool_] = (can_ids & np.uint32(_BLOCK)) == FIRST_ID
     return found
 
 
@@ -74,7 +76,7 @@ def has_aiding(can_ids: NDArray[np.uint32]) -> bool:
     """Whether there is one among identifiers."""
     found = False
     for can_id in can_ids:
-        found |= can_id & (0xFFFFFFFF - (RESERVED_IDS - 1)) == FIRST_ID
+        found |= can_id & _BLOCK == FIRST_ID
     return found
 
 
