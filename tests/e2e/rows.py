@@ -20,6 +20,15 @@ COUNTERS = (
     *("restarts", "frozen", "clock_steps", "silences"),
 )
 """Counters of the summary that a fault may move."""
+OF_FRAMES: dict[str, dict[str, Any]] = {
+    "drop": {"share": 0.05, "for_s": 0.5},
+    "duplicate": {"share": 0.05, "for_s": 0.5},
+    "reorder": {"share": 0.05, "for_s": 0.5},
+    "delay": {"delay_s": 0.3, "for_s": 0.5},
+    "jitter": {"delay_s": 0.02, "for_s": 0.5},
+    "bit-flip": {"share": 0.05, "for_s": 0.5},
+}
+"""Faults that every line has alike."""
 UNITS = {"delay_s": " s", "step_s": " s", "drift_ppm": " ppm"}
 
 

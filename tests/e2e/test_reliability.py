@@ -4,19 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rows import each_fault, note, recorded, said
+from rows import OF_FRAMES, each_fault, note, recorded, said
 
 from drivers.can.dtg_head import DtgHead
 from hil.pytest_plugin import StartBridge
 
 RATE_HZ, FIRST_S, EVERY_S = 200, 2.0, 2.0
 FAULTS: dict[str, dict[str, Any]] = {
-    "drop": {"share": 0.05, "for_s": 0.5},
-    "duplicate": {"share": 0.05, "for_s": 0.5},
-    "reorder": {"share": 0.05, "for_s": 0.5},
-    "delay": {"delay_s": 0.3, "for_s": 0.5},
-    "jitter": {"delay_s": 0.02, "for_s": 0.5},
-    "bit-flip": {"share": 0.05, "for_s": 0.5},
+    **OF_FRAMES,
     "crc-off": {"for_s": 0.05},
     "counter-freeze": {"for_s": 0.05},
     "babble": {"rate_hz": 2000, "for_s": 0.5},

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rows import counts, each_fault, note, recorded, said
+from rows import OF_FRAMES, counts, each_fault, note, recorded, said
 
 sys.path.append(str(Path(__file__).parents[1] / "drivers" / "serial"))
 from pty_board import BOARDS, Plugged, moving
@@ -26,12 +26,7 @@ SCENARIO = {
 
 FIRST_S, EVERY_S, BEHIND_S = 2.0, 2.0, 1.5
 FAULTS: dict[str, dict[str, Any]] = {
-    "drop": {"share": 0.05, "for_s": 0.5},
-    "duplicate": {"share": 0.05, "for_s": 0.5},
-    "reorder": {"share": 0.05, "for_s": 0.5},
-    "delay": {"delay_s": 0.3, "for_s": 0.5},
-    "jitter": {"delay_s": 0.02, "for_s": 0.5},
-    "bit-flip": {"share": 0.05, "for_s": 0.5},
+    **OF_FRAMES,
     "babble": {"rate_hz": 100, "for_s": 0.5},
     "clock-step": {"step_s": 0.5},
     "clock-drift": {"drift_ppm": 200, "for_s": 0.5},

@@ -88,14 +88,22 @@ def test_all_kinds_at_once_in_real_time(hil_bridge: StartBridge) -> None:
     assert "problems" not in summary
 
 
-def test_the_death_of_a_feed_is_said_and_the_run_goes_on(hil_bridge: StartBridge) -> None:
-    bridge = hil_bridge(navigation=TRUTH, motion=MOVING, duration_s=12, paced=False, mavlink={"links": ()}, feed=[JSON])
+def lockstep(hil_bridge: StartBridge) -> tuple[Any, Sitl, int]:
+    """A run in simulated time, the autopilot of its feed behind the first frame, and the process of the feed."""
+    bridge: Any = hil_bridge(
+        navigation=TRUTH, motion=MOVING, duration_s=12, paced=False, mavlink={"links": ()}, feed=[JSON]
+    )
     sitl = Sitl(port(bridge.session.feed_places()[0]))
     sitl.socket.settimeout(30.0)
     sitl.frame()
-    process = bridge.session._parts["feed 0"].process
-    assert process.pid
-    os.kill(process.pid, signal.SIGKILL)
+    pid = bridge.session._parts["feed 0"].process.pid
+    assert pid
+    return bridge, sitl, pid
+
+
+def test_the_death_of_a_feed_is_said_and_the_run_goes_on(hil_bridge: StartBridge) -> None:
+    bridge, _sitl, feed = lockstep(hil_bridge)
+    os.kill(feed, signal.SIGKILL)
     summary = bridge.wait_end(60)
     assert summary["problems"] == ["the feed 0 process died (exit code -9)"]
     assert summary["samples"] == 12000
@@ -103,13 +111,8 @@ def test_the_death_of_a_feed_is_said_and_the_run_goes_on(hil_bridge: StartBridge
 
 def test_a_stopped_feed_holds_simulated_time_and_it_is_said(hil_bridge: StartBridge) -> None:
     """A feed that is stopped cannot give its autopilot up: the user has to know what the run waits for."""
-    bridge = hil_bridge(navigation=TRUTH, motion=MOVING, duration_s=12, paced=False, mavlink={"links": ()}, feed=[JSON])
-    sitl = Sitl(port(bridge.session.feed_places()[0]))
-    sitl.socket.settimeout(30.0)
-    sitl.frame()
-    process = bridge.session._parts["feed 0"].process
-    assert process.pid
-    os.kill(process.pid, signal.SIGSTOP)
+    bridge, sitl, feed = lockstep(hil_bridge)
+    os.kill(feed, signal.SIGSTOP)
     deadline = time.monotonic() + 30.0
     while not bridge.session.problems and time.monotonic() < deadline:
         assert bridge.session.running
@@ -117,9 +120,9 @@ def test_a_stopped_feed_holds_simulated_time_and_it_is_said(hil_bridge: StartBri
     (said,) = bridge.session.problems
     assert said == "the feed 0 process does not answer: it is stopped or starved, and simulated time waits for it"
     waiting = bridge.session.outlets.stats["samples"]
-    os.kill(process.pid, signal.SIGCONT)
+    os.kill(feed, signal.SIGCONT)
     sitl.frame()
-    os.kill(process.pid, signal.SIGKILL)  # nobody is waited for any more
+    os.kill(feed, signal.SIGKILL)  # nobody is waited for any more
     summary = bridge.wait_end(60)
     assert waiting < summary["samples"] == 12000
 
