@@ -360,7 +360,7 @@ class DtgHead:
             self._protection["HEAD_SAMPLE"].check(self._data[:n], self._good[:n])
             self._sample.decode(self._data[:n], self._raw[:n])
             _reorder(self._raw[:n], self._columns, self._values)
-            return self._accept(n, chosen["time_ns"], said[is_sample])
+            return self._accept(n, batch["time_ns"][is_sample], said[is_sample])
         return self._classic_samples(batch, said)
 
     def _accept(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:

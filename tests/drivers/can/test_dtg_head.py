@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers import driver_names, make_driver
-from drivers.can.dtg_head import DtgHead
+from drivers.can.dtg_head import DtgHead, _fill, _track
 from drivers.can.dtg_head_emulator import HeadEncoder
 from drivers.can.frames import EFF, ERR, FDF, RTR, frames
 from nav.errors import HilError
@@ -342,3 +342,13 @@ def test_temperatures_hold_for_the_samples_that_follow_them(layout):
     assert np.isnan(rows.temperature[:3]).all()
     assert rows.temperature[3:].tolist() == [[40.0, 40.0, 35.0]] * 3
     assert driver.identity()["temperature_acc"] == 35.0
+
+
+@layouts
+def test_samples_beside_slow_frames_take_the_kernels_of_those_alone(layout):
+    """A first one in the middle of a run would hold the loop up while it is compiled."""
+    driver, slow = told(layout), deepcopy(_new_encoder(layout)).slow()
+    driver.decode(sent(layout, range(3)))
+    ways = {kernel: len(kernel.signatures) for kernel in (_track, _fill)}
+    assert len(driver.decode(np.concatenate([slow, sent(layout, range(3, 6))]))) == 3
+    assert {kernel: len(kernel.signatures) for kernel in ways} == ways
