@@ -21,6 +21,8 @@ from hil.source import FileSource
 from nav.errors import HilError
 
 TICK_S = 0.05
+COMPILING_S = 0.2
+"""Taking a batch does not last so long, unless it compiles what decodes it: the first time on a machine."""
 LISTEN_S = 1.0
 """How long a serial port is listened to before another baud rate is tried."""
 
@@ -58,7 +60,11 @@ def watch_bus(
     with contextlib.closing(port), view or contextlib.nullcontext():
         began = shown = time.monotonic()
         while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
-            monitor.take(batch[: port.receive(batch, TICK_S)])
+            heard = batch[: port.receive(batch, TICK_S)]
+            before = time.monotonic()
+            monitor.take(heard)
+            if (took := time.monotonic() - before) > COMPILING_S:
+                began += took  # this was no listening
             if view is not None and time.monotonic() - shown >= view.period_s:
                 shown = time.monotonic()
                 view.show(monitor.report(time.time_ns(), recent=True, port=port))

@@ -104,7 +104,11 @@ GUEST
 } >"$work/init"
 chmod 755 "$work/init"
 
-setsid timeout -k 3 "$limit" "${preload[@]}" linux.uml mem="$memory" umid=guest uml_dir="$work/uml" quiet loglevel=3 \
+# The guest has one processor. On one of the host's it hands over to its processes three times faster than across two.
+pin=()
+command -v taskset >/dev/null && pin=(taskset -c "$(taskset -cp $$ | sed 's/.*[ ,-]//')")
+
+setsid timeout -k 3 "$limit" "${pin[@]}" "${preload[@]}" linux.uml mem="$memory" umid=guest uml_dir="$work/uml" quiet loglevel=3 \
   rootfstype=hostfs rootflags=/ ro init="$work/init" \
   con=null con0=null,fd:5 con1=null,fd:3 con2=null,fd:4 console=tty0 \
   3>&1 4>&2 5>"$work/log" </dev/null >/dev/null 2>&1 &

@@ -21,13 +21,16 @@ class Lead:
         self._most = 0
         self._at: int | None = None
         self._risen = 0
+        self._settling = 0
+        """The lead when it last rose by `FASTER_NS`: arrivals that say nothing rise by less each, and go on rising."""
 
     def note(self, time_ns: int, arrival_ns: int) -> None:
         """Take the sample that ended at `time_ns` and came at `arrival_ns`."""
         lead = time_ns - arrival_ns
-        if self._at is None or lead > self._most + FASTER_NS:
-            self._risen = time_ns
+        if self._at is None or lead > self._settling + FASTER_NS:
+            self._risen, self._settling = time_ns, lead
         self._most = lead if self._at is None else max(lead, self._most - (time_ns - self._at) // DRIFT)
+        self._settling = min(self._settling, self._most)
         self._at = time_ns
 
     def leaps(self, time_ns: int, arrival_ns: int, steps: int, period_ns: int) -> bool:

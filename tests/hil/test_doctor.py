@@ -101,8 +101,9 @@ def test_a_real_classic_interface_is_a_note() -> None:
 @pytest.mark.socketcan
 def test_a_can_interface_has_a_state_and_a_board() -> None:
     assert named("vcan0") == [{"what": "vcan0", "verdict": "ok", "found": "up, mtu 72", "mend": ""}]
-    imu = ImuIncrements.empty(2000)
-    imu.step[:], imu.time[:], imu.sequence[:] = 0.01, 0.01 * np.arange(1, 2001), np.arange(2000)
+    n = 40_000  # more than a minute: the first probe on a machine compiles
+    imu = ImuIncrements.empty(n)
+    imu.step[:], imu.time[:], imu.sequence[:] = 0.01, 0.01 * np.arange(1, n + 1), np.arange(n)
     imu.dvel[:, 2] = -0.0981
     emulator = make_emulator("xsens-can", 10_000)
     batch = emulator.samples(imu)

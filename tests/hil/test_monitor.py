@@ -290,6 +290,17 @@ def test_lines_where_there_is_no_terminal() -> None:
     assert f"hil run --imu sbg --bus {url}" in err
 
 
+def test_what_is_compiled_at_the_first_frames_is_not_listened(tmp_path: Path) -> None:
+    """On a machine that has compiled nothing yet, two seconds tell the board as well."""
+    url = f"unix:mon-{time.monotonic_ns():x}"
+    command = [sys.executable, "-c", "from hil.cli import main; main()", "monitor", "--bus", url, "--json"]
+    fresh = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    with sending(url, sent_by("sbg", 60_000)):
+        found = subprocess.run([*command, "--duration", "1"], capture_output=True, env=fresh, timeout=300, check=True)
+    assert any(tmp_path.rglob("*.nbi"))
+    assert json.loads(found.stdout)["driver"] == "sbg"
+
+
 def test_a_table_that_renews_itself_in_a_terminal() -> None:
     url = f"unix:mon-{time.monotonic_ns():x}"
     command = [sys.executable, "-c", "from hil.cli import main; main()", "monitor", "--bus", url, "--duration", "2"]

@@ -76,3 +76,13 @@ def test_bytes_that_come_sooner_behind_a_gap_do_not_hide_it(missing: int, earlie
         arrival_s = k * period_s + (0.0 if k < 300 else -earlier_s) + 0.3
         timeline.place(round(1e9 * k * period_s), 0, round(1e9 * period_s), round(1e9 * arrival_s))
     assert (counters.lost, counters.clock_steps) == (missing, 0)
+
+
+@pytest.mark.parametrize("tick_ns", [0, 100_000])
+def test_arrivals_that_say_nothing_leave_a_leap_a_gap(tick_ns: int) -> None:
+    """All bytes came in one read, or a recording stamps what was read by its place: nobody knows when they were sent."""
+    counters = Counters()
+    timeline = Timeline(counters, 1 << 64, 0)
+    for at, k in enumerate([*range(300), *range(800, 1000)]):
+        timeline.place(10_000_000 * k, 0, 10_000_000, tick_ns * at)
+    assert (counters.lost, counters.clock_steps) == (500, 0)
