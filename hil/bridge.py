@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from drivers import FrameDriver, make_driver
 from drivers.can.aiding import AidingDecoder, has_aiding, is_aiding
+from drivers.can.dtg_head import DtgHead
 from drivers.can.frames import FrameArray, frames
 from drivers.logs.recording import EVENT, MARK, REALIGN, SILENCE, event_record
 from hil.calibration import NO_HEAD, validated
@@ -33,6 +34,7 @@ from hil.control import Control
 from hil.feed.quantisation import warnings
 from hil.feed.tap import Gate
 from hil.health import HEALTH, HealthWriter
+from hil.lane import DECODED, DONE, OTHER, Lane
 from hil.magnetometer import correct
 from hil.other_attitude import Estimator, OtherAttitude
 from hil.realtime import claim, rest
@@ -47,6 +49,7 @@ from hil.wire_watch import WireWatch
 from hil.world.instruments import head_model, mounting
 from hil.world.truth import TruthKeeper
 from nav.aiding import AIDING, Kind, of_receivers
+from nav.cut import Cut
 from nav.errors import HilError
 from nav.filter.record import Recorder
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray
@@ -170,6 +173,8 @@ class Loop:
         self._other = OtherAttitude(self.driver) if isinstance(self.driver, Estimator) else None
         self._keep_trace = order.keep_trace
         self._clock = LoopClock(outlets.stats, partial(self.navigator.tell, station=True))
+        head = self.driver if isinstance(self.driver, DtgHead) else None
+        self._lane = None if head is None else Lane(head, self._combiner, self.navigator, outlets.states)
         self._restarts = 0
         self._arrival_ns = 0
         self._started: float | None = None
@@ -185,13 +190,17 @@ class Loop:
 
     def take(self, batch: FrameArray) -> bool:
         """Decode and navigate a batch of frames; True when it held a sample."""
+        lone = self._lone(self._lane, batch) if len(batch) == 1 and self._lane is not None else None
+        got = self._batch(batch) if lone is None else lone
+        self._health.count(batch)
+        return got
+
+    def _batch(self, batch: FrameArray) -> bool:
         driver, got, start = self.driver, False, 0
         while driver.period_s is None and start < len(batch):  # one by one until the board has said what it is
             got = self._between(batch[start : start + 1]) or got
             start += 1
-        got = self._between(batch[start:] if start else batch) or got
-        self._health.count(batch)
-        return got
+        return self._between(batch[start:] if start else batch) or got
 
     def _between(self, batch: FrameArray) -> bool:
         """Take frames, the measurements among them in their place between the samples."""
@@ -224,9 +233,39 @@ class Loop:
             rows = rows[~there]
         return rows
 
+    def _lone(self, lane: Lane, batch: FrameArray) -> bool | None:
+        """As `take` for a lone frame, by the quick lane as far as that goes; None, and nothing has changed, when it does not."""
+        is_ready = self._calibrated is None and not (self._from_truth or self.finished)
+        if self._started is None or not is_ready or (self._truth is None and self.driver.world_id == self._world):
+            return None
+        duration = self.scenario.duration_s
+        stage = lane.take(batch, math.inf if duration is None else self._started + duration)
+        if stage == OTHER:
+            return None
+        raw = lane.samples(stage)
+        if stage == DECODED:
+            return self._decoded(batch, raw)
+        self._now = time_s = float(raw.time[0])
+        self._covered = time_s - self._started
+        self.samples += 1
+        imu = self._combiner.told(raw, lane.answer)
+        self._tell_notes()
+        arrivals = self.driver.arrivals()
+        if stage == DONE:
+            self._follow(raw, self.navigator.passed(time_s), arrivals, lane.in_ring_ns)
+        else:
+            rows = self.navigator.process(imu)
+            rows["arrival_ns"] = arrivals[0]
+            self._follow(raw, rows, arrivals, self._push(rows))
+        self._count(batch)
+        return True
+
     def _take(self, batch: FrameArray) -> bool:
+        return self._decoded(batch, self.driver.decode(batch))
+
+    def _decoded(self, batch: FrameArray, raw: HeadIncrements | ImuIncrements) -> bool:
+        """Navigate what the driver has found in a batch."""
         driver = self.driver
-        raw = driver.decode(batch)
         if len(raw) == 0:
             self._count(batch)
             return False
@@ -259,22 +298,30 @@ class Loop:
             return
         imu = self._combine(raw) if isinstance(raw, HeadIncrements) else self._turned(raw)
         rows = self.navigator.process(imu)
-        self._arrival_ns = arrival = int(arrivals[-1])
-        rows["arrival_ns"] = arrival if len(rows) != len(arrivals) else arrivals
-        self._publish(rows)
+        rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
+        self._follow(raw, rows, arrivals, self._push(rows))
+
+    def _follow(
+        self, raw: HeadIncrements | ImuIncrements, rows: NDArray[Any], arrivals: IntArray, in_ring_ns: int
+    ) -> None:
+        """What comes behind the ring, where the `rows` of the samples `raw` are."""
+        self._arrival_ns = int(arrivals[-1])
+        self._compare(rows)
         self._health.take(raw, self._truth is not None)
         stats = self._outlets.stats
         if self._live:
-            stats.count_since(Times.LATENCY, time.time_ns(), arrivals)
-            self._clock.take(float(imu.time[-1]), arrival)
-        if len(rows) != len(imu):
-            stats["interpolated"] += len(rows) - len(imu)
+            stats.count_since(Times.LATENCY, in_ring_ns, arrivals)
+            self._clock.take(float(raw.time[-1]), self._arrival_ns)
+        if len(rows) != len(raw):
+            stats["interpolated"] += len(rows) - len(raw)
+
+    def _tell_notes(self) -> None:
+        for note in self._combiner.notes():
+            self.navigator.tell(note.time, "error" if note.bad else "notice", note.text)
 
     def _combine(self, raw: HeadIncrements) -> ImuIncrements:
-        combiner = self._combiner
-        imu = combiner.combine(raw)
-        for note in combiner.notes():
-            self.navigator.tell(note.time, "error" if note.bad else "notice", note.text)
+        imu = self._combiner.combine(raw)
+        self._tell_notes()
         if self._calibrated is not None and "serial" in (identity := self.driver.identity()):
             if identity["serial"] != self._calibrated:
                 text = f"the calibration is of head {self._calibrated}, and head {identity['serial']} is connected"
@@ -323,7 +370,8 @@ class Loop:
         if event == SILENCE:
             rows = self.navigator.silent()
             rows["arrival_ns"] = self._arrival_ns
-            self._publish(rows)
+            self._push(rows)
+            self._compare(rows)
             self._outlets.stats["silences"] += 1
         elif event == REALIGN:
             self._combiner.renew()
@@ -349,10 +397,15 @@ class Loop:
         self._outlets.states.latest(row)
         return row[0]
 
-    def _publish(self, rows: NDArray[Any]) -> None:
-        outlets = self._outlets
+    def _push(self, rows: NDArray[Any]) -> int:
+        """Put solutions into the ring; when they were there, by the host's clock."""
         rows["solution_ns"] = time.time_ns()
-        outlets.states.push(rows)
+        self._outlets.states.push(rows)
+        return time.time_ns()
+
+    def _compare(self, rows: NDArray[Any]) -> None:
+        """Add solutions to what is known of all, and tell what happened."""
+        outlets = self._outlets
         self._digest.update(rows.view(np.uint8).reshape(len(rows), -1)[:, HOST_FIELDS:].tobytes())
         for event in self.navigator.events():
             self._note(event.time, event.severity, event.text, event.station)
@@ -472,6 +525,7 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
 
 def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, looks: bool) -> None:
     batch = frames(BATCH)
+    views = Cut[FrameArray](lambda n: batch[:n])
     silence_ns = round(order.scenario.navigation.silence_s * 1e9)
     wait = min(TICK_S, order.scenario.navigation.silence_s / 4)
     heard: int | None = None
@@ -482,29 +536,30 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, look
     while not (control.stop or loop.finished or source.exhausted):
         if outlets.gate is not None:
             outlets.gate.wait(outlets.states, outlets.states.capacity // 2, lambda: control.stop)
-        n = source.receive(batch, 0.0 if time.monotonic_ns() < look_until else wait)
-        now = time.monotonic_ns()
-        stats["beat_ns"] = now
-        if source.trouble != trouble:
-            trouble = source.trouble
-            loop.say("error" if trouble else "notice", trouble or f"{order.scenario.bus} is back", station=True)
+        n = source.receive(batch, 0.0 if look_until and time.monotonic_ns() < look_until else wait)
+        woken_ns, now = time.time_ns(), time.monotonic_ns()
         if n:
-            taken, samples = batch[:n], loop.samples
-            woken_ns = time.time_ns() - int(taken["time_ns"][n - 1]) if source.live else 0
-            _record(taken, outlets, order.paced)
-            if order.file is not None and taken["reserved"][:, 0].any():
-                got = take_with_events(loop, taken)
-            else:
-                got = loop.take(taken)
+            taken, samples = views[n], loop.samples
+            try:
+                if order.file is not None and taken["reserved"][:, 0].any():
+                    got = take_with_events(loop, taken)
+                else:
+                    got = loop.take(taken)
+            finally:
+                _record(taken, outlets, order.paced)  # what ends the run is recorded as well
             if got:
                 heard = now
                 stats["phase"] = Phase.RUNNING
             if source.live:
                 took = time.monotonic_ns() - now
-                stats.count(Times.WAKE, woken_ns)
+                stats.count(Times.WAKE, woken_ns - int(taken["time_ns"][n - 1]))
                 stats.count(Times.ROUND, took)
                 if got and took > 1e9 * (loop.samples - samples) * (loop.driver.period_s or math.inf):
                     stats["overruns"] += 1
+        stats["beat_ns"] = now
+        if source.trouble != trouble:
+            trouble = source.trouble
+            loop.say("error" if trouble else "notice", trouble or f"{order.scenario.bus} is back", station=True)
         for k, ring in enumerate(outlets.aiding):
             if ring.count > relayed_numbers[k] and not loop.finished:
                 copied, first = ring.pull(relayed, relayed_numbers[k])

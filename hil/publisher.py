@@ -23,6 +23,7 @@ from drivers.mavlink.hub import Hub, total
 from drivers.mavlink.intake import Intake
 from drivers.mavlink.options import LinkOptions, parse_options
 from drivers.mavlink.signing import Signer, read_key
+from drivers.mavlink.solution import Solution
 from drivers.mavlink.station import Identity, Station
 from drivers.mavlink.store import Store, state_folder
 from hil.clock import clock_reading
@@ -39,6 +40,8 @@ from nav.turn import euler_of
 
 _SILENCE_S = 1.0
 """Without a solution for this long the status says so, whatever the last solution said."""
+_COLD_S = 0.005
+"""What was not done for so long is in no cache of the processor any more, and takes two to three times as long."""
 _READ_S = 0.1
 """A solution is read at least this often, for the status."""
 _AGES = 1 << 16
@@ -217,6 +220,8 @@ class _Publisher:
             self._told_s = now_s
             self._links.tell(self._hub.tallies())
         slow = self._ring.count - self._seen == 1  # do not wait for its next solution
+        if self._hungry() and not slow and now_s - self._read_s > _COLD_S:
+            self._rehearse()
         if self._hungry() and (slow or (self._looks and self._look())):
             now_s = time.monotonic()
             self._read(now_s)
@@ -232,7 +237,15 @@ class _Publisher:
         return self._ring.count != newest
 
     def _hungry(self) -> bool:
-        return any(endpoint.waits for endpoint in self._hub.endpoints)
+        return any(endpoint.waits is not None for endpoint in self._hub.endpoints)
+
+    def _rehearse(self) -> None:
+        """Do with the last solution what the next one will need, so that its way is in the processor's caches."""
+        row = np.zeros(1, NAV_STATE)
+        if self._ring.latest(row):
+            solution = Solution.of(row[0], self._station.geoid)
+            for endpoint in self._hub.endpoints:
+                endpoint.rehearse(solution)
 
     def _poll(self, now_s: float) -> float:
         return self._hub.poll(now_s)

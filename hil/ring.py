@@ -15,6 +15,8 @@ from numba import types
 from numba.core.extending import intrinsic
 from numpy.typing import NDArray
 
+from drivers.system import call
+from nav.increments import IntArray
 from nav.kernel import kernel
 
 Bytes = NDArray[np.uint8]
@@ -32,8 +34,9 @@ def _fence(typing_context: Any) -> Any:
 
 
 @kernel
-def _push(head: NDArray[np.int64], locks: NDArray[np.int64], slots: Bytes, rows: Bytes) -> None:
-    """Write `rows` (n, size) behind `head`; a slot's lock is odd while it changes and 2 * (number + 1) after."""
+def push(parts: tuple[IntArray, IntArray, Bytes, IntArray, IntArray], rows: Bytes) -> None:
+    """`Ring.push` with the ring's `parts`; a slot's lock is odd while it changes and 2 * (number + 1) after."""
+    head, locks, slots, wakes, room = parts
     capacity = locks.shape[0]
     number = head[0]
     for i in range(rows.shape[0]):
@@ -47,10 +50,11 @@ def _push(head: NDArray[np.int64], locks: NDArray[np.int64], slots: Bytes, rows:
         locks[k] = 2 * number
     _fence()
     head[0] = number
+    call(wakes, room)
 
 
 @kernel
-def _pull(head: NDArray[np.int64], locks: NDArray[np.int64], slots: Bytes, rows: Bytes, number: int) -> tuple[int, int]:
+def _pull(head: IntArray, locks: IntArray, slots: Bytes, rows: Bytes, number: int) -> tuple[int, int]:
     """Copy records from `number` on into `rows`; returns (copied, number of the first one copied)."""
     capacity = locks.shape[0]
     newest = head[0]
@@ -153,6 +157,9 @@ class Ring:
         self._locks = np.frombuffer(memory, np.int64, capacity, 64)
         slots = np.frombuffer(memory, np.uint8, capacity * dtype.itemsize, 64 + 8 * capacity)
         self._slots = slots.reshape(capacity, dtype.itemsize)
+        called = np.array([wake.fileno() for wake in wakes], np.int64)
+        self.parts = self._head, self._locks, self._slots, called, np.zeros(2, np.int64)
+        """For kernels (`push`)."""
 
     def __reduce__(self) -> Any:
         return _reattach, (self.dtype, self.capacity, self._shared, self.wakes)
@@ -164,9 +171,7 @@ class Ring:
 
     def push(self, rows: NDArray[Any]) -> None:
         """Write `rows` ((n,) of `dtype`, contiguous) and wake the readers."""
-        _push(self._head, self._locks, self._slots, rows.view(np.uint8).reshape(len(rows), self.dtype.itemsize))
-        for wake in self.wakes:
-            wake.call()
+        push(self.parts, rows.view(np.uint8).reshape(len(rows), self.dtype.itemsize))
 
     def pull(self, rows: NDArray[Any], number: int) -> tuple[int, int]:
         """Copy records from number `number` on into `rows`.

@@ -30,7 +30,7 @@ from nav.gaps import Gap, GapFiller, GapPolicy
 from nav.increments import FloatArray, ImuIncrements, IntArray, Validity
 from nav.kernel import kernel
 from nav.lever_arm import shift
-from nav.ordinary import take_one
+from nav.ordinary import Parts, take_one
 from nav.rotation import euler_from_quaternion
 from nav.solutions import Solutions, StateArray
 from nav.state import Health, Mode, Ratio
@@ -170,6 +170,7 @@ class Navigator:
         self._events: list[Event] = []
         self._solutions = Solutions()
         self._worthless = np.full(9, np.inf, np.float32), np.zeros(len(Ratio), np.float32)
+        self._parts: Parts | None = None
 
     def events(self) -> list[Event]:
         """What happened since the last call."""
@@ -308,17 +309,35 @@ class Navigator:
 
     def _take_one(self, imu: ImuIncrements) -> bool:
         """Take an ordinary sample (:mod:`nav.ordinary`); False, and nothing has changed, when it is not one."""
-        core, filler, health = self._core, self._filler, int(self.health)
-        if not self._plain or not core.address or self.mode < Mode.NAVIGATE or health & _SILENT:
-            return False
-        expected, what = (filler.expected, self._flagged, _FLAGS), (int(self.mode), health, 1.0)
+        ready = self.ordinary()
         sample = imu.time, imu.step, imu.dtheta, imu.dvel, imu.validity, imu.sequence
-        out = self._solutions.buffer, filler.rate, filler.force
-        if not take_one(core.address, expected, what, *sample, self.gyro_bias, *self._worthless, *out):
+        if ready is None or not take_one(*ready, self.parts, sample):
             return False
-        filler.passed(expected[0], float(imu.time[0]))
-        self._state[:] = core.solution
+        self.passed(float(imu.time[0]))
         return True
+
+    def ordinary(self) -> tuple[int, tuple[int, int, int], tuple[int, int, float]] | None:
+        """What :func:`nav.ordinary.take_one` needs to know besides `parts`; None when the next sample is not ordinary."""
+        health = int(self.health)
+        if not self._plain or not self._core.address or self.mode < Mode.NAVIGATE or health & _SILENT:
+            return None
+        return self._core.address, (self._filler.expected, self._flagged, _FLAGS), (int(self.mode), health, 1.0)
+
+    @property
+    def parts(self) -> Parts:
+        """For :func:`nav.ordinary.take_one`; another tuple whenever something in it is."""
+        parts = self._parts
+        if parts is None or parts[0] is not self.gyro_bias or parts[3] is not self._solutions.buffer:
+            filler = self._filler
+            parts = self.gyro_bias, *self._worthless, self._solutions.buffer, filler.rate, filler.force
+            self._parts = parts
+        return parts
+
+    def passed(self, time: float) -> StateArray:
+        """Take over the sample that ended at `time`, s, and that `take_one` has taken; its row, valid until the next sample."""
+        self._filler.passed(self._filler.expected, time)
+        self._state[:] = self._core.solution
+        return self._solutions.room(1)
 
     def _move(self, sign: float, w_ib_b: FloatArray | None = None) -> None:
         """Move the state from the navigated point to the sensor (`sign` 1) or back (-1)."""

@@ -18,24 +18,18 @@ from nav.step import DONE, SOLUTION_PART, push
 
 _SOLUTION = 8 * SOLUTION_PART.start
 
+Parts = tuple[FloatArray, NDArray[np.float32], NDArray[np.float32], NDArray[Any], FloatArray, FloatArray]
+"""Gyro bias (3,), rad/s; sigmas (9,) and ratios (len(Ratio),), what the solution is worth; out: rows of `NAV_STATE` (2 or more,),
+the solution in row 1 and again in row 0; out: rate and force of the sample (3,), rad/s and m/s^2."""
+
 
 @kernel
 def take_one(
     core: int,
     expected: tuple[int, int, int],
     what: tuple[int, int, float],
-    time: FloatArray,
-    step: FloatArray,
-    dtheta: FloatArray,
-    dvel: FloatArray,
-    validity: IntArray,
-    sequence: IntArray,
-    gyro_bias: FloatArray,
-    sigma: NDArray[np.float32],
-    ratio: NDArray[np.float32],
-    rows: NDArray[Any],
-    rate: FloatArray,
-    force: FloatArray,
+    parts: Parts,
+    sample: tuple[FloatArray, FloatArray, FloatArray, FloatArray, IntArray, IntArray],
 ) -> bool:
     """Take the only sample; False, and nothing has changed, when it is not an ordinary one.
 
@@ -49,17 +43,13 @@ def take_one(
         Sequence number, flags, and which flags count.
     what : tuple
         Mode, health, progress.
-    time, step, dtheta, dvel, validity, sequence
-        Of :class:`nav.increments.ImuIncrements`.
-    gyro_bias : (3,) float
-        rad/s.
-    sigma, ratio : (9,), (len(Ratio),) float32
-        What the solution is worth.
-    rows : (2 or more,) array of NAV_STATE
-        Out: the solution, in row 1 and again in row 0.
-    rate, force : (3,) float
-        Out: of the sample, rad/s and m/s^2.
+    parts : tuple
+        See `Parts`.
+    sample : tuple
+        The arrays of :class:`nav.increments.ImuIncrements`, with one row each.
     """
+    gyro_bias, sigma, ratio, rows, rate, force = parts
+    time, step, dtheta, dvel, validity, sequence = sample
     number, flags, mask = expected
     t = step[0]
     if sequence[0] != number or validity[0] & mask != flags or not t > 0.0 or first_bad(time, step, dtheta, dvel) >= 0:

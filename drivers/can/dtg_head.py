@@ -52,7 +52,11 @@ _FD_SIGNALS = (
 )
 _Work = tuple[NDArray[np.uint8], FloatArray, FloatArray, NDArray[np.bool_], FloatArray, IntArray, IntArray, IntArray]
 """Payloads, values in the order of the DBC and in ours, checks, what was said, stamps; rows and stamps of samples."""
+_Samples = tuple[FloatArray, FloatArray, IntArray, IntArray]
 _Sensed = tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray, FloatArray]
+_Parts = tuple[tuple[int, int, int, int], FloatArray, IntArray, IntArray, _Work, IntArray, IntArray, _Samples, _Sensed]
+"""Identifier, length, data id and counter modulus of a sample; what was said; table and order of its signals; room; tracker and
+its outcomes; samples."""
 # State of the tracker.
 _STARTED, _LAST_COUNTER, _SEQUENCE, _LAST_US, _TIME_US, _SEEN = range(6)
 # Outcomes of the tracker.
@@ -212,22 +216,12 @@ def _reorder(raw: FloatArray, columns: IntArray, values: FloatArray) -> None:
 
 
 @kernel
-def _take(
-    frames: NDArray[np.uint8],
-    what: tuple[int, int, int, int],
-    now: FloatArray,
-    table: IntArray,
-    columns: IntArray,
-    work: _Work,
-    state: IntArray,
-    outcome: IntArray,
-    samples: tuple[FloatArray, FloatArray, IntArray, IntArray],
-    sensed: _Sensed,
-) -> int:
+def take(parts: _Parts, frames: NDArray[np.uint8]) -> int:
     """The accepted samples of frames (n, 80) that are all FD samples; -1, and nothing has changed, when they are not.
 
-    `what`: identifier, length, data id and counter modulus of the message.
+    `parts`: those of the `DtgHead`.
     """
+    what, now, table, columns, work, state, outcome, samples, sensed = parts
     n = frames.shape[0]
     data, raw, values, good, said, stamps, rows, times = work
     can_id, length, data_id, modulus = what
@@ -329,6 +323,9 @@ class DtgHead:
         batch = self._batch
         self._samples = batch.time, batch.step, batch.sequence, batch.validity
         self._sensed = batch.dtheta, batch.rotor, batch.dvel, batch.status, batch.spin, batch.temperature
+        layout = self._what, self._now, self._sample.table, self._columns
+        self.parts = *layout, self._work, self._state, self._outcome, self._samples, self._sensed
+        """For kernels (`take`)."""
 
     def identity(self) -> dict[str, object]:
         """Serial, hardware, sample period, temperatures, rotor speeds, supply and built-in test, as last heard."""
@@ -343,11 +340,10 @@ class DtgHead:
         n = len(batch)
         if n > len(self._batch):
             self._room(2 * n)
-        self.counters.frames += n
-        where = self._work, self._state, self._outcome, self._samples, self._sensed
-        count = _take(as_bytes(batch), self._what, self._now, self._sample.table, self._columns, *where)
+        count = take(self.parts, as_bytes(batch))
         if count >= 0:
-            return self._counted(count)
+            return self.taken(n, count)
+        self.counters.frames += n
         said = self._said[:n]
         ids = batch["can_id"]
         is_sample = (ids == self._sample.can_id) & (batch["length"] == 64) & ((batch["flags"] & FDF) != 0)
@@ -362,6 +358,11 @@ class DtgHead:
             _reorder(self._raw[:n], self._columns, self._values)
             return self._accept(n, batch["time_ns"][is_sample], said[is_sample])
         return self._classic_samples(batch, said)
+
+    def taken(self, n: int, count: int) -> HeadIncrements:
+        """The `count` samples that `take` has found in `n` frames."""
+        self.counters.frames += n
+        return self._counted(count)
 
     def _accept(self, n: int, times: IntArray, said: FloatArray) -> HeadIncrements:
         values, (dtheta, rotor, dvel, status, spin, temperature) = self._values[:n], self._sensed

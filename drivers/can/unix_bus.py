@@ -24,7 +24,10 @@ import numpy as np
 
 from drivers.can.convert import from_message, to_message
 from drivers.can.frames import FRAME, FrameArray, frames
+from drivers.system import day_ns, receive, send
 from nav.errors import HilError
+from nav.increments import IntArray
+from nav.kernel import kernel
 
 PACKET = 64
 """Most frames in one packet."""
@@ -33,6 +36,16 @@ _MUTE = "-mute"
 """End of the socket's name of a pure sender."""
 _BACKLOG = 4096
 """Most participants that may join while one does not look."""
+
+
+@kernel
+def _stamp_and_send(fds: IntArray, packet: FrameArray, keep: bool, refused: IntArray) -> int:
+    """Give frames the time, but for those that `keep` one, and send them to each of `fds`; how many of these `refused` them."""
+    now = day_ns(refused)
+    for k in range(packet.shape[0]):
+        if not keep or packet[k].time_ns == 0:
+            packet[k].time_ns = now
+    return send(fds, packet, refused)
 
 
 class UnixPort:
@@ -58,6 +71,11 @@ class UnixPort:
         self.name = name
         self.dropped = 0
         """Frames that did not fit into a listener's queue."""
+        self._batch = frames(PACKET)
+        self._room = self._batch.view(np.uint8)
+        """Bytes of the batch that is filled."""
+        _stamp_and_send(np.zeros(0, np.int64), self._batch, False, np.zeros(2, np.int64))  # compiled now, not in a run
+        receive(-1, self._room, 0, PACKET * FRAME.itemsize)
         self._listen = listen
         self._lossless = lossless
         self._peers: dict[int, socket.socket] = {}
@@ -134,41 +152,36 @@ class UnixPort:
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """Fill `batch` (at least `PACKET` long) with what is there; waits up to `timeout` s for the first frame."""
-        filled = 0
-        deadline = time.monotonic() + timeout
-        view = batch.view(np.uint8).data
+        if batch is not self._batch:
+            self._batch, self._room = batch, batch.view(np.uint8)
+        filled, until = 0, 0.0
         while filled == 0:
-            ready = self._epoll.poll(max(0.0, deadline - time.monotonic()))
+            ready = self._epoll.poll(max(0.0, until - time.monotonic()) if until else timeout)
             if not ready:
                 return 0
             for fd, _ in ready:
                 if fd == self._listener.fileno():
+                    until = until or time.monotonic() + timeout
                     self._accept()
                     continue
-                while filled + PACKET <= len(batch):
-                    try:
-                        size = self._peers[fd].recv_into(view[filled * FRAME.itemsize :])
-                    except BlockingIOError:
-                        break
-                    except OSError:
-                        size = 0
-                    if size == 0:
-                        self._remove(fd)
-                        break
-                    filled += size // FRAME.itemsize
-        return filled
+                filled, is_gone = receive(fd, self._room, filled, PACKET * FRAME.itemsize)
+                if is_gone:
+                    until = until or time.monotonic() + timeout
+                    self._remove(fd)
+        return filled // FRAME.itemsize
 
     def send(self, batch: FrameArray) -> None:
-        """Send `batch` to every listener, stamped with the host's clock; when lossless, a stamp that a frame has is kept."""
+        """Send `batch` to every listener, stamped with the host's clock; when lossless, a stamp that a frame has is kept.
+
+        `batch` is contiguous; its stamps are set.
+        """
         self._accept()
         for start in range(0, len(batch), PACKET):
             packet = batch[start : start + PACKET]
-            stamps = packet["time_ns"]
-            stamps[(stamps == 0) | (not self._lossless)] = time.time_ns()
-            data = packet.tobytes()
-            for fd, peer in list(self._peers.items()):
-                if fd not in self._deaf:
-                    self._send_one(fd, peer, data)
+            fds = np.array([fd for fd in self._peers if fd not in self._deaf], np.int64)
+            refused = np.zeros(len(fds) + 2, np.int64)
+            for fd in refused[: _stamp_and_send(fds, packet, self._lossless, refused)].tolist():
+                self._send_one(fd, self._peers[fd], packet.tobytes())
 
     def _send_one(self, fd: int, peer: socket.socket, data: bytes) -> None:
         while True:

@@ -21,6 +21,7 @@ from drivers.mavlink.link import Link
 from drivers.mavlink.messages import KINDS, Kind, Message
 from drivers.mavlink.options import LinkOptions
 from drivers.mavlink.signing import Signer
+from drivers.mavlink.solution import Solution
 from drivers.mavlink.station import SEVERITIES, Station
 from nav.state import Health, Mode
 
@@ -88,10 +89,11 @@ class Endpoint:
         """Stretches of bytes that were no message."""
         self.dropped = 0
         """Messages that a link with a peer did not take."""
-        self.waits = False
-        """Whether something is due that goes out with the next solution."""
+        self.waits: Kind | None = None
+        """What is due and goes out with the next solution, the most urgent of it."""
         self._signer, self._number = signer if self.options.sign else None, number
         self._packer = mav.MAVLink(None, station.identity.system_id, station.identity.component_id)
+        self._rehearsal = mav.MAVLink(None, station.identity.system_id, station.identity.component_id)
         self._parser = mav.MAVLink(None)
         self._parser.robust_parsing = True
         self._sequences: dict[tuple[int, int], int] = {}
@@ -114,13 +116,18 @@ class Endpoint:
         self.station.on_home.remove(self._send_home)
 
     def poll(self, now_s: float) -> float:
-        """Read what has arrived, answer it, send what is due; returns when to come again at the latest."""
+        """Send what is due, read what has arrived and answer it; returns when to come again at the latest."""
         self.station.now_s = now_s
-        data = self.link.receive()  # one piece: what is due may not wait behind a flood
-        for message in self._parsed(data) if data else ():
+        next_s = self._send(now_s)
+        if not (data := self.link.receive()):  # one piece: what is due may not wait behind a flood
+            return next_s
+        for message in self._parsed(data):
             self._take(message)
+        return self._send(now_s)  # what that has brought
+
+    def _send(self, now_s: float) -> float:
         if not self.link.ready():
-            self.waits, self._told, self._event = False, self.station.noted, self.station.events.count
+            self.waits, self._told, self._event = None, self.station.noted, self.station.events.count
             return now_s + _AGAIN_S
         self._announce(now_s)
         if self.wants_events:
@@ -142,6 +149,11 @@ class Endpoint:
             self.log.write(frame)
         if name == "ATTITUDE":
             self.station.on_attitude()
+
+    def rehearse(self, solution: Solution) -> None:
+        """Build what waits for the next solution, of this one, and send nothing: its code is in the caches then."""
+        if self.waits is not None and (message := self.waits.build(solution, self.station.situation)) is not None:
+            message.pack(self._rehearsal)
 
     def say(self, severity: str, text: str) -> None:
         """Have something said at once, whatever else waits to be told."""
@@ -204,13 +216,13 @@ class Endpoint:
     def _send_due(self, now_s: float) -> float:
         next_s = math.inf
         number = self.station.number
-        self.waits = False
+        self.waits = None
         for stream in self._streams.values():
             if stream.interval_s == 0.0:
                 continue
             if stream.due_s <= now_s:
                 if stream.kind.from_solution and stream.number == number:
-                    self.waits = True
+                    self.waits = self.waits or stream.kind
                     continue
                 message = stream.kind.build(self.station.solution, self.station.situation)
                 if message is not None:

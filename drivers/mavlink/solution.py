@@ -4,14 +4,41 @@ Frames and units as in :mod:`nav`.
 """
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any
 
 from nav.earth import E2, RATE, A
-from nav.state import Health, Mode
+from nav.state import NAV_STATE, Health, Mode
 from nav.turn import euler_of
+
+if TYPE_CHECKING:
+    from functools import cached_property
+else:
+
+    class cached_property:
+        """That of functools as it is from Python 3.12 on, without a lock."""
+
+        def __init__(self, function):
+            self._function, self.__doc__ = function, function.__doc__
+
+        def __get__(self, instance, owner=None):
+            """Work it out the first time."""
+            value = instance.__dict__[self._function.__name__] = self._function(instance)
+            return value
+
+
+_CODES = {"<i8": "q", "<i4": "i", "<f8": "d", "<f4": "f"}
+_LENGTHS = {name: math.prod(NAV_STATE[name].shape) for name in NAV_STATE.names or ()}
+_ROW = struct.Struct("<" + "".join(f"{n}{_CODES[NAV_STATE[name].base.str]}" for name, n in _LENGTHS.items()))
+"""A row as plain numbers, which numpy gives one by one only."""
+_PARTS = {
+    name: slice(end - _LENGTHS[name], end) for name, end in zip(_LENGTHS, accumulate(_LENGTHS.values()), strict=True)
+}
+_SINGLE = [_PARTS[name].start for name in ("arrival_ns", "time", "mode", "health", "lat", "lon", "height")]
+_SEVERAL = [_PARTS[name] for name in ("vel_n", "q_nb", "w_ib_b", "f_b", "sigma", "test_ratio")]
 
 Vector = tuple[float, float, float]
 Undulation = Callable[[float, float], float]
@@ -64,23 +91,11 @@ class Solution:
     @classmethod
     def of(cls, row: Any, geoid: Undulation) -> "Solution":
         """The solution in `row`, one record of `NAV_STATE`."""
-        values = dict(zip(row.dtype.names, row.item(), strict=True))
-        return cls(
-            time=values["time"],
-            arrival_ns=values["arrival_ns"],
-            mode=Mode(values["mode"]),
-            health=Health(values["health"]),
-            lat=values["lat"],
-            lon=values["lon"],
-            height=values["height"],
-            vel_n=tuple(values["vel_n"].tolist()),
-            q_nb=tuple(values["q_nb"].tolist()),
-            w_ib_b=tuple(values["w_ib_b"].tolist()),
-            f_b=tuple(values["f_b"].tolist()),
-            sigma=tuple(values["sigma"].tolist()),
-            test_ratio=tuple(values["test_ratio"].tolist()),
-            geoid=geoid,
-        )
+        numbers = _ROW.unpack(row.tobytes())
+        arrival_ns, time, mode, health, lat, lon, height = (numbers[k] for k in _SINGLE)
+        vel_n, q_nb, w_ib_b, f_b, sigma, test_ratio = (numbers[part] for part in _SEVERAL)
+        where = lat, lon, height, vel_n, q_nb, w_ib_b, f_b, sigma, test_ratio
+        return cls(time, arrival_ns, Mode(mode), Health(health), *where, geoid)
 
     @cached_property
     def has_imu(self) -> bool:
@@ -165,7 +180,7 @@ def geodetic(home: Home, ned: Vector) -> Vector:
 
 
 def _usable(*values: float) -> bool:
-    return all(abs(value) < _LARGEST for value in values)  # False for NaN too
+    return math.hypot(*values) < _LARGEST  # False for NaN too
 
 
 def _ecef_of(place: Home) -> Vector:

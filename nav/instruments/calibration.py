@@ -188,20 +188,24 @@ def _at_temperature(
     return outside
 
 
+Parts = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Rows of the gyros and of the accelerometers; A^-1; reference, coldest, warmest (3, 3); temperatures of the last sample (3,),
+and its biases and gains (2, 7)."""
+UNCALIBRATED: Parts = (
+    np.zeros((4, _TERM + 8)),
+    np.zeros((3, len(_ACCELEROMETER_ROW))),
+    np.zeros((3, 3)),
+    np.zeros((3, 3)),
+    np.zeros(3),
+    np.zeros((2, 7)),
+)
+"""In the place of `Calibrator.parts` where there is none."""
+
+
 @kernel
-def _take_off(
-    gyros: FloatArray,
-    forces: FloatArray,  # rows of the accelerometers
-    inverse: FloatArray,  # A^-1
-    ranges: FloatArray,  # (3, 3) reference, coldest, warmest
-    last: FloatArray,  # (3,) temperatures of `now`
-    now: FloatArray,
-    step: FloatArray,
-    temperature: FloatArray,
-    gyro: FloatArray,
-    dvel: FloatArray,
-) -> int:
-    """All samples in place; the first whose temperature has just left the range, or -1."""
+def take_off(parts: Parts, step: FloatArray, temperature: FloatArray, gyro: FloatArray, dvel: FloatArray) -> int:
+    """`Calibrator.take_off` with its `parts`."""
+    gyros, forces, inverse, ranges, last, now = parts
     left = -1
     for k in range(step.shape[0]):
         t = step[k]
@@ -256,15 +260,12 @@ class Calibrator:
         matrix = calibration.accelerometer_matrix()
         if not np.linalg.cond(matrix) < 10.0:
             raise HilError("calibration: the accelerometers' scale factors and misalignments must be small")
-        self._tables: tuple[FloatArray, FloatArray, FloatArray, FloatArray] = (
-            _gyro_rows(calibration.gyros, skew),
-            _rows(calibration.accelerometers, _ACCELEROMETER_ROW, 3),
-            np.linalg.inv(matrix).astype(np.float64),
-            np.array([calibration.reference, calibration.coldest, calibration.warmest]),
-        )
-        self._last, self._now = np.full(3, np.nan), np.empty((2, 7))
-        gyros, accelerometers, _, ranges = self._tables
-        _at_temperature(self._last, ranges[0], ranges[1], ranges[2], gyros, accelerometers, self._now)
+        gyros, forces = _gyro_rows(calibration.gyros, skew), _rows(calibration.accelerometers, _ACCELEROMETER_ROW, 3)
+        ranges = np.array([calibration.reference, calibration.coldest, calibration.warmest])
+        last, now = np.full(3, np.nan), np.empty((2, 7))
+        _at_temperature(last, ranges[0], ranges[1], ranges[2], gyros, forces, now)
+        self.parts: Parts = gyros, forces, np.linalg.inv(matrix).astype(np.float64), ranges, last, now
+        """For kernels (`take_off`)."""
 
     def take_off(self, head: HeadIncrements, gyro: FloatArray, dvel: FloatArray) -> int:
         """Take the errors off a batch, in place; allocates nothing.
@@ -283,7 +284,7 @@ class Calibrator:
         int
             The first sample whose temperature has just come to lie outside the range; -1 for none.
         """
-        return int(_take_off(*self._tables, self._last, self._now, head.step, head.temperature, gyro, dvel))
+        return int(take_off(self.parts, head.step, head.temperature, gyro, dvel))
 
 
 def outside(calibration: Calibration, temperature: ArrayLike) -> str:

@@ -80,19 +80,16 @@ def _mean(steps: FloatArray, increments: FloatArray, gyro: int, filled: int) -> 
 
 
 @kernel
-def _compensate(
-    table: ComplexArray,
-    counts: IntArray,
-    last: ComplexArray,
-    steps: FloatArray,
-    increments: FloatArray,
+def take_off_lag(
+    parts: tuple[ComplexArray, IntArray, ComplexArray, FloatArray, FloatArray],
     sequence: IntArray,
     step: FloatArray,
     dtheta: FloatArray,
     rotor: FloatArray,
     out: FloatArray,
 ) -> int:
-    """All samples of a batch; the row of the first that cannot be, or -1."""
+    """`LagCompensator.compensate` with its `parts`; the row of the first sample that cannot be, or -1."""
+    table, counts, last, steps, increments = parts
     for k in range(step.shape[0]):
         total = step[k] + dtheta[k, 0] + dtheta[k, 1] + dtheta[k, 2] + dtheta[k, 3]
         if not (math.isfinite(total) and step[k] > 0.0):
@@ -150,10 +147,9 @@ class LagCompensator:
     """
 
     def __init__(self, gyro_1: Rotor = HEAD, gyro_2: Rotor = HEAD) -> None:
-        self._table = np.array([coefficients(gyro_1), coefficients(gyro_2)])
-        self._counts = np.zeros(4, np.int64)
-        self._last = np.zeros(2, np.complex128)
-        self._steps, self._increments = np.zeros(WINDOW), np.zeros((WINDOW, 4))
+        table, last = np.array([coefficients(gyro_1), coefficients(gyro_2)]), np.zeros(2, np.complex128)
+        self.parts = table, np.zeros(4, np.int64), last, np.zeros(WINDOW), np.zeros((WINDOW, 4))
+        """For kernels (`take_off_lag`): coefficients, what is known, last rotor angles, the window."""
 
     def compensate(self, head: HeadIncrements, out: FloatArray) -> None:
         """The increments of a batch without the lag; allocates nothing.
@@ -170,10 +166,7 @@ class LagCompensator:
         HilError
             An increment is not finite, or a step is not positive.
         """
-        window = self._steps, self._increments
-        bad = _compensate(
-            self._table, self._counts, self._last, *window, head.sequence, head.step, head.dtheta, head.rotor, out
-        )
+        bad = take_off_lag(self.parts, head.sequence, head.step, head.dtheta, head.rotor, out)
         if bad >= 0:
             raise HilError(
                 f"lag compensation: sample {head.sequence[bad]} has a step of {head.step[bad]} s and increments "

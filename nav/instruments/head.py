@@ -9,15 +9,16 @@ are flagged: a noisy or saturated axis then goes on being used, a dead one count
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field
+from typing import Any
 
 import numpy as np
 
 from nav.cut import Cut
 from nav.increments import FloatArray, HeadIncrements, ImuIncrements, IntArray, Validity
 from nav.instruments import redundancy
-from nav.instruments.calibration import Calibration, Calibrator, outside
+from nav.instruments.calibration import UNCALIBRATED, Calibration, Calibrator, outside, take_off
 from nav.instruments.dtg import Rotor
-from nav.instruments.dtg_compensation import LagCompensator
+from nav.instruments.dtg_compensation import LagCompensator, take_off_lag
 from nav.instruments.pendulum import Pendulum
 from nav.instruments.redundancy import AXES, Fault, Limits
 from nav.instruments.size_effect import MEMORY as SIZE_MEMORY
@@ -28,6 +29,7 @@ from nav.kernel import kernel
 _LOST = Fault.STUCK | Fault.NOISE | Fault.SATURATED | Fault.BUILT_IN
 _STATUS_AXES = ((0, 1), (2, 3), (4,), (5,), (6,))
 """Axes of the status bits 0..4."""
+_NO_LAG, _NO_SIZE = LagCompensator().parts, np.zeros((3, 9))
 SPEED_TOLERANCE = 0.01
 """A rotor speed off by more than this share is a failed gyro."""
 
@@ -64,6 +66,10 @@ class HeadModel:
     variances: FloatArray | None = None
 
 
+_Sample = tuple[
+    FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, IntArray, IntArray, IntArray, FloatArray, FloatArray
+]
+"""The arrays of `HeadIncrements` with one row each."""
 _Views = tuple[FloatArray, ImuIncrements, IntArray, FloatArray]
 """Of some samples: increments of the gyro axes, what becomes of them, what is said of them, parity residual."""
 
@@ -118,6 +124,46 @@ def _take_over(
         validity_out[k] = validity[k]
 
 
+FAULT, OUTSIDE = 1, 2
+"""What `combine_one` may answer: an axis has failed or is good again; the temperature has just left the calibrated range."""
+
+
+@kernel
+def combine_one(parts: Any, sample: _Sample) -> int:
+    """`HeadCombiner.combine` of the only sample with its `parts`; -1, and nothing has changed, when instruments say news.
+
+    Else what is to be told (`HeadCombiner.told`): the sum of `FAULT` and `OUTSIDE`, or 0. The sample is finite and has a length.
+    """
+    does, said, lag, calibration, size, tests, turn, out = parts
+    has_lag, is_calibrated, has_size, is_pair = does
+    status, flag = said
+    time, step, raw, rotor, sent, validity_in, sequence, told, spin, temperature = sample
+    gyro, dtheta, dvel, validity, now, residual = out
+    speeds, inverse, c_bh = turn
+    memory, faults, before, parity, limits = tests
+    _take_over(told, spin, speeds, sent, validity_in, now, dvel, validity)
+    if now[0] != status:
+        return -1
+    answer = 0
+    if has_lag:
+        take_off_lag(lag, sequence, step, raw, rotor, gyro)
+    else:
+        gyro[:] = raw
+    if is_calibrated and take_off(calibration, step, temperature, gyro, dvel) >= 0:
+        answer = OUTSIDE
+    before[:] = faults
+    redundancy.examine(memory, faults, time, step, raw, gyro, sent, parity, limits, is_pair, residual)
+    _combine(gyro, inverse, flag, dtheta, validity)
+    for axis in range(faults.shape[0]):
+        if faults[axis] != before[axis]:
+            answer |= FAULT
+    if has_size:
+        size_memory, coefficients = size
+        take_off_size_effect(size_memory, coefficients, step, dtheta, dvel, dvel)
+    _turn(c_bh, dtheta, dvel)
+    return answer
+
+
 @kernel
 def _same_until(said: IntArray, start: int) -> int:
     """The end of the samples from `start` on of which the same is said."""
@@ -145,6 +191,8 @@ class HeadCombiner:
 
     def __init__(self, model: HeadModel) -> None:
         self._c_bh = np.ascontiguousarray(model.c_bh, dtype=float)
+        self.parts: tuple[Any, ...] = ()
+        """For kernels (`combine_one`); another tuple whenever something in it is."""
         calibration = self._calibration = model.calibration
         self._h = redundancy.layout(model.skew) if calibration is None else calibration.gyro_matrix(model.skew)
         self._weights = np.ones(4) if model.variances is None else model.variances.max() / model.variances
@@ -157,11 +205,11 @@ class HeadCombiner:
         self._size_memory = np.zeros(SIZE_MEMORY)
         self._limits = astuple(model.limits)
         self._notes: list[Note] = []
-        self.faults = np.zeros(7, np.int64)
+        self.faults, self._before = np.zeros(7, np.int64), np.zeros(7, np.int64)
         self.residual = np.zeros(0)
+        self._speeds = np.array([rotor.spin / (2.0 * math.pi) for rotor in self._rotors or ()])
         self._views = Cut(self._cut)
         self._room(256)
-        self._speeds = np.array([rotor.spin / (2.0 * math.pi) for rotor in self._rotors or ()])
         self.renew()
 
     def renew(self) -> None:
@@ -220,11 +268,21 @@ class HeadCombiner:
         _turn(self._c_bh, dtheta, dvel)
         return ImuIncrements(head.time, head.step, dtheta, dvel, validity, head.sequence)
 
+    def told(self, head: HeadIncrements, answer: int) -> ImuIncrements:
+        """The only sample of `head` in body axes, which `combine_one` has taken with this answer; valid until the next one."""
+        _, imu, _, self.residual = self._views[1]
+        if answer & OUTSIDE:
+            self._say_outside(head, 0)
+        if answer & FAULT:
+            self._tell(float(head.time[0]), self._before)
+        return ImuIncrements(head.time, head.step, imu.dtheta, imu.dvel, imu.validity, head.sequence)
+
     def _calibrate(self, head: HeadIncrements, gyro: FloatArray, dvel: FloatArray) -> None:
-        if self._calibration is None or self._calibrator is None:
-            return
-        left = self._calibrator.take_off(head, gyro, dvel)
-        if left >= 0 and not self._outside:
+        if self._calibrator is not None and (left := self._calibrator.take_off(head, gyro, dvel)) >= 0:
+            self._say_outside(head, left)
+
+    def _say_outside(self, head: HeadIncrements, left: int) -> None:
+        if self._calibration is not None and not self._outside:
             self._outside = True
             where = outside(self._calibration, head.temperature[left])
             text = f"the calibration does not reach this temperature: {where} C; the values of its edge are used"
@@ -238,6 +296,7 @@ class HeadCombiner:
                 self.faults[list(axes)] |= Fault.BUILT_IN.value
         if (self.faults != before).any():
             self._tell(time, before)
+        self._gather()
 
     def _weigh(self) -> None:
         """Leave out what is lost."""
@@ -253,13 +312,26 @@ class HeadCombiner:
         inverse = redundancy.combination(self._h, np.where(lost, 0.0, self._weights))
         bad = inverse is None or doubt or bool((self.faults[4:] & _LOST.value).any())
         self._flag = int(Validity.SENSOR) if bad else int(Validity.SPARE) if lost.any() else 0
+        self._spans = inverse is not None
         if inverse is None:  # better a bad measurement than none; a dead one is none
             dead = (gyros & Fault.STUCK.value) != 0
-            self._inverse = np.linalg.pinv(np.where(dead[:, None], 0.0, self._h))
-        else:
-            self._inverse = inverse
+            inverse = np.linalg.pinv(np.where(dead[:, None], 0.0, self._h))
+        self._inverse = np.ascontiguousarray(inverse)
         self._parity = np.zeros(4) if lost.any() else redundancy.parity_vector(self._h)
-        self._doubt, self._spans = doubt, inverse is not None
+        self._doubt = doubt
+        self._gather()
+
+    def _gather(self) -> None:
+        """Hand `combine_one` what has changed."""
+        does = self._lag is not None, self._calibrator is not None, self._size is not None, self._pair
+        lag = _NO_LAG if self._lag is None else self._lag.parts
+        calibration = UNCALIBRATED if self._calibrator is None else self._calibrator.parts
+        size = self._size_memory, _NO_SIZE if self._size is None else self._size
+        tests = self._memory, self.faults, self._before, self._parity, self._limits
+        imu = self._imu
+        out = self._gyro[:1], imu.dtheta[:1], imu.dvel[:1], imu.validity[:1], self._said[:1], self._residuals[:1]
+        turn = self._speeds, self._inverse, self._c_bh
+        self.parts = does, (self._status, self._flag), lag, calibration, size, tests, turn, out
 
     def _tell(self, time: float, before: IntArray) -> None:
         self._weigh()
@@ -297,6 +369,8 @@ class HeadCombiner:
         self._views.clear()
         self._imu, self._gyro = ImuIncrements.empty(n), np.zeros((n, 4))
         self._said, self._residuals = np.zeros(n, np.int64), np.zeros(n)
+        if self.parts:
+            self._gather()
 
 
 def _words(fault: Fault) -> str:
