@@ -32,17 +32,17 @@ def call(wakes: NDArray[np.int64], room: IntArray) -> None:
 
 
 @kernel
-def receive(fd: int, room: NDArray[np.uint8], start: int, least: int) -> tuple[int, bool]:
+def receive(fd: int, room: NDArray[np.uint8], start: int, least: int, unit: int) -> int:
     """Put the packets that wait at the socket `fd` into `room` from `start` on, while it has `least` bytes; where they end.
 
-    True as well when the other end is gone.
+    Of each packet whole records of `unit` bytes count.
     """
     while start + least <= room.shape[0]:
         size = _recv(fd, room.ctypes.data + start, room.shape[0] - start, _DONTWAIT)
         if size <= 0:
-            return start, size == 0
-        start += size
-    return start, False
+            break
+        start += size - size % unit
+    return start
 
 
 @kernel

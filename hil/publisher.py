@@ -219,9 +219,9 @@ class _Publisher:
         if self._links is not None and now_s - self._told_s > _TELL_S:
             self._told_s = now_s
             self._links.tell(self._hub.tallies())
-        slow = self._ring.count - self._seen == 1  # do not wait for its next solution
-        if self._hungry() and not slow and now_s - self._read_s > _COLD_S:
+        if self._hungry() and self._ring.count - self._seen != 1 and now_s - self._read_s > _COLD_S:
             self._rehearse()
+        slow = self._ring.count - self._seen == 1  # do not wait for its next solution
         if self._hungry() and (slow or (self._looks and self._look())):
             now_s = time.monotonic()
             self._read(now_s)

@@ -75,7 +75,7 @@ class UnixPort:
         self._room = self._batch.view(np.uint8)
         """Bytes of the batch that is filled."""
         _stamp_and_send(np.zeros(0, np.int64), self._batch, False, np.zeros(2, np.int64))  # compiled now, not in a run
-        receive(-1, self._room, 0, PACKET * FRAME.itemsize)
+        receive(-1, self._room, 0, PACKET * FRAME.itemsize, FRAME.itemsize)
         self._listen = listen
         self._lossless = lossless
         self._peers: dict[int, socket.socket] = {}
@@ -125,7 +125,9 @@ class UnixPort:
         self._peers[peer.fileno()] = peer
 
     def _remove(self, fd: int) -> None:
-        peer = self._peers.pop(fd)
+        peer = self._peers.pop(fd, None)
+        if peer is None:  # another thread was quicker
+            return
         self._deaf.discard(fd)
         if self._listen:
             self._epoll.unregister(fd)
@@ -164,24 +166,27 @@ class UnixPort:
                     until = until or time.monotonic() + timeout
                     self._accept()
                     continue
-                filled, is_gone = receive(fd, self._room, filled, PACKET * FRAME.itemsize)
-                if is_gone:
+                before = filled
+                filled = receive(fd, self._room, filled, PACKET * FRAME.itemsize, FRAME.itemsize)
+                if filled == before:  # the end, an error or rubbish
                     until = until or time.monotonic() + timeout
-                    self._remove(fd)
+                    peer = self._peers.get(fd)
+                    if peer is not None and _has_gone(peer):
+                        self._remove(fd)
         return filled // FRAME.itemsize
 
     def send(self, batch: FrameArray) -> None:
-        """Send `batch` to every listener, stamped with the host's clock; when lossless, a stamp that a frame has is kept.
-
-        `batch` is contiguous; its stamps are set.
-        """
+        """Send `batch` to every listener, stamped with the host's clock; when lossless, a stamp that a frame has is kept."""
         self._accept()
+        if not (batch.flags.c_contiguous and batch.flags.writeable):
+            batch = batch.copy()
         for start in range(0, len(batch), PACKET):
             packet = batch[start : start + PACKET]
-            fds = np.array([fd for fd in self._peers if fd not in self._deaf], np.int64)
-            refused = np.zeros(len(fds) + 2, np.int64)
-            for fd in refused[: _stamp_and_send(fds, packet, self._lossless, refused)].tolist():
-                self._send_one(fd, self._peers[fd], packet.tobytes())
+            peers = {fd: peer for fd, peer in list(self._peers.items()) if fd not in self._deaf}
+            refused = np.zeros(len(peers) + 2, np.int64)
+            count = _stamp_and_send(np.array(list(peers), np.int64), packet, self._lossless, refused)
+            for fd in refused[:count].tolist():
+                self._send_one(fd, peers[fd], packet.tobytes())
 
     def _send_one(self, fd: int, peer: socket.socket, data: bytes) -> None:
         while True:
@@ -259,6 +264,16 @@ def check_name(name: str) -> None:
     """Refuse (`HilError`) what is no name of a bus."""
     if not re.fullmatch(r"[A-Za-z0-9._-]{1,40}", name) or name.startswith("."):
         raise HilError(f"unix:{name}: a bus name has 1 to 40 letters, digits, dots, dashes or underscores")
+
+
+def _has_gone(peer: socket.socket) -> bool:
+    """Whether nothing more can come from a peer that has nothing for us now."""
+    try:
+        return not peer.recv(1, socket.MSG_PEEK)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
 
 
 def _alive(peer: socket.socket) -> bool:

@@ -116,10 +116,11 @@ class Endpoint:
         self.station.on_home.remove(self._send_home)
 
     def poll(self, now_s: float) -> float:
-        """Send what is due, read what has arrived and answer it; returns when to come again at the latest."""
+        """Send what is due, and answer what has arrived; returns when to come again at the latest."""
         self.station.now_s = now_s
+        data = self.link.receive()  # one piece: what is due may not wait behind a flood; to send may end the connection
         next_s = self._send(now_s)
-        if not (data := self.link.receive()):  # one piece: what is due may not wait behind a flood
+        if not data:
             return next_s
         for message in self._parsed(data):
             self._take(message)

@@ -26,6 +26,8 @@ else:
 
         def __get__(self, instance, owner=None):
             """Work it out the first time."""
+            if instance is None:
+                return self
             value = instance.__dict__[self._function.__name__] = self._function(instance)
             return value
 

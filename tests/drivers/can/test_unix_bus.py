@@ -293,3 +293,31 @@ def test_threads_of_one_process_may_join_at_once():
     assert all(len(drain(port, 5)) == 5 for port in ports[1:])
     for port in ports:
         port.close()
+
+
+def test_a_packet_that_is_no_whole_frames_disturbs_no_other():
+    with closing(UnixPort("rubbish")) as port, closing(UnixPort("rubbish", listen=False)) as other:
+        assert other.listeners == 1
+        (wire,) = other._peers.values()
+        for junk in (b"abc", bytes(200), bytes(79)):
+            wire.send(junk)
+            other.send(numbered(3, 10))
+            other.send(numbered(2, 20))
+        got = numbers(drain(port, 17, 0.2)).tolist()
+        good = [10, 11, 12, 20, 21]
+        assert got == [*good, 0, 0, *good, *good]  # 200 bytes are two frames and a half
+        wire.send(b"abc")
+        before = time.monotonic()
+        assert port.receive(frames(PACKET), 0.2) == 0
+        assert 0.15 < time.monotonic() - before < 1.0
+
+
+def test_frames_that_lie_apart_or_may_not_be_stamped_are_sent_as_they_are():
+    with closing(UnixPort("apart")) as port, closing(UnixPort("apart", listen=False)) as other:
+        other.send(numbered(8)[::2])
+        assert numbers(drain(port, 4)).tolist() == [0, 2, 4, 6]
+        fixed = numbered(3)
+        fixed.flags.writeable = False
+        other.send(fixed)
+        assert numbers(drain(port, 3)).tolist() == [0, 1, 2]
+        assert not fixed["time_ns"].any()

@@ -211,6 +211,23 @@ def test_clients_of_a_server_come_and_go_by_themselves() -> None:
     net.hub.close()
 
 
+@pytest.mark.parametrize("served_s", [0.0, 0.5])
+def test_the_last_words_of_a_client_that_has_closed_are_heard(served_s: float) -> None:
+    net = Net(LinkOptions("tcpin:127.0.0.1:0"))
+    for count in range(1, 11):
+        client = Peer(socket.create_connection(("127.0.0.1", net.hub.listeners[0][0].port)))
+        if served_s:
+            time.sleep(0.01)
+            net.run(served_s)
+        client.tell(mav.MAVLink_request_data_stream_message(1, 1, mav.MAV_DATA_STREAM_EXTRA1, 10, 1))
+        client.sock.close()
+        time.sleep(0.01)
+        net.run(0.1)
+        assert net.hub.tallies()["tcpin:127.0.0.1:0"]["received"] == {"REQUEST_DATA_STREAM": count}
+    assert not net.hub.endpoints
+    net.hub.close()
+
+
 def test_messages_lost_on_the_way_to_us_are_counted() -> None:
     net = Net(LinkOptions("tcpin:127.0.0.1:0"))
     peer = dial(net)
