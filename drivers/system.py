@@ -24,7 +24,7 @@ def day_ns(room: IntArray) -> int:
 
 
 @kernel
-def call(wakes: NDArray[np.int64], room: IntArray) -> None:
+def call(wakes: IntArray, room: IntArray) -> None:
     """Add one to each event counter (eventfd); `room` is (1 or more,) of scratch."""
     room[0] = 1
     for fd in wakes:

@@ -254,9 +254,7 @@ class Loop:
         if stage == DONE:
             self._follow(raw, self.navigator.passed(time_s), arrivals, lane.in_ring_ns)
         else:
-            rows = self.navigator.process(imu)
-            rows["arrival_ns"] = arrivals[0]
-            self._follow(raw, rows, arrivals, self._push(rows))
+            self._navigate(raw, imu, arrivals)
         self._count(batch)
         return True
 
@@ -296,7 +294,10 @@ class Loop:
             self._truth = self._own_truth
         if self._from_truth and not self._begin(raw):
             return
-        imu = self._combine(raw) if isinstance(raw, HeadIncrements) else self._turned(raw)
+        self._navigate(raw, self._combine(raw) if isinstance(raw, HeadIncrements) else self._turned(raw), arrivals)
+
+    def _navigate(self, raw: HeadIncrements | ImuIncrements, imu: ImuIncrements, arrivals: IntArray) -> None:
+        """Put the solutions of `imu`, which are the samples `raw` in body axes, into the ring."""
         rows = self.navigator.process(imu)
         rows["arrival_ns"] = arrivals[-1] if len(rows) != len(arrivals) else arrivals
         self._follow(raw, rows, arrivals, self._push(rows))
