@@ -5,12 +5,11 @@ import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import BadZipFile
 
 import numpy as np
 
 from drivers.can.aiding import AidingArray
-from hil.tables import parquet
+from hil.tables import archived, parquet
 from nav.aiding import AIDING, Kind
 from nav.errors import HilError
 from nav.increments import FloatArray
@@ -61,7 +60,7 @@ def read_aiding(path: Path) -> AidingArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(AID_HEADER)}") from error
-    except (ValueError, EOFError, BadZipFile, NotImplementedError, csv.Error) as error:  # no text, archive or table
+    except (ValueError, csv.Error) as error:  # no text, archive or table
         raise HilError(f"{path}: {error}") from error
     if not lines:
         raise HilError(f"{path}: no rows")
@@ -85,12 +84,7 @@ def _text(path: Path) -> Iterator[tuple[str, list[Any]]]:
 
 
 def _archive(path: Path) -> Iterator[tuple[str, list[Any]]]:
-    with np.load(path, allow_pickle=False) as archive:
-        found = [archive[name] for name in AID_HEADER]
-    if not all(isinstance(column, np.ndarray) and column.ndim == 1 for column in found):
-        raise ValueError("a column is no array of one dimension")  # numpy hands on the bytes of a member that is none
-    columns = [column.tolist() for column in found]
-    yield from _numbered(columns)
+    yield from _numbered([column.tolist() for column in archived(path, AID_HEADER)])
 
 
 def _frame(path: Path) -> Iterator[tuple[str, list[Any]]]:

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
+from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 
 from nav.errors import HilError
 from nav.increments import FloatArray
@@ -24,8 +25,7 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":
-            with np.load(path, allow_pickle=False) as archive:
-                table = np.stack([np.asarray(archive[name], float) for name in header], axis=1)
+            table = np.stack([column.astype(float) for column in archived(path, header)], axis=1)
         elif suffix == ".parquet":
             frame = parquet().read_table(path, columns=list(header))
             table = np.stack([np.asarray(frame[name].to_numpy(), float) for name in header], axis=1)
@@ -35,7 +35,7 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(header)}") from error
-    except (ValueError, EOFError, BadZipFile, NotImplementedError) as error:  # not text, no archive, unequal columns
+    except ValueError as error:  # not text, unequal columns
         raise HilError(f"{path}: {error}") from error
     if len(table) == 0:
         raise HilError(f"{path}: no rows")
@@ -93,6 +93,33 @@ def write_table(path: Path, header: tuple[str, ...], table: FloatArray) -> None:
             np.savetxt(path, table, fmt="%.17g", delimiter=",", header=",".join(header), comments="")
     except OSError as error:
         raise HilError(f"{path}: {error.strerror or error}") from error
+
+
+def archived(path: Path, header: tuple[str, ...]) -> list[NDArray[Any]]:
+    """The columns `header` (n,) of a ``.npz`` file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    KeyError
+        A column is missing.
+    ValueError
+        It is no archive, or a column is no array of one dimension.
+    """
+    try:
+        found = np.load(path, allow_pickle=False)
+        if not isinstance(found, NpzFile):  # a bare array
+            raise ValueError("no archive of columns")
+        with found as archive:
+            columns = [archive[name] for name in header]
+    except (OSError, KeyError):
+        raise
+    except Exception as error:  # numpy and zipfile raise whatever the bytes provoke
+        raise ValueError(f"not a readable .npz file: {error}") from error
+    if not all(isinstance(column, np.ndarray) and column.ndim == 1 for column in columns):
+        raise ValueError("a column is no array of one dimension")  # numpy hands on the bytes of a member that is none
+    return columns
 
 
 def parquet() -> Any:

@@ -5,6 +5,7 @@ magnetometer and barometer, each at the time at which it was true: its time stam
 takes for it. Standard deviations are those that the receiver states; the others are those of the autopilot's filter.
 """
 
+import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -55,7 +56,8 @@ def read_ulog(path: Path) -> ImuLog:
     except ImportError as error:
         raise HilError("reading ULog needs pyulog: pip install 'dtg-hil[logs]'") from error
     try:
-        log = ULog(str(path), list(_TOPICS))
+        with _Torn(io.FileIO(path)) as file:
+            log = ULog(file, list(_TOPICS))
     except OSError as error:
         raise HilError(f"log {path}: {error.strerror}") from error
     except Exception as error:  # pyulog raises whatever the bytes provoke
@@ -80,6 +82,23 @@ def read_ulog(path: Path) -> ImuLog:
         raise HilError(f"log {path}: a topic lacks its column {error}") from error
     except HilError as error:
         raise HilError(f"log {path}: {error}") from error
+
+
+class _Torn(io.BufferedReader):
+    """A file that may end within a message, which pyulog would go back over whole, past its start, and read again for ever."""
+
+    _lacked = 0
+
+    def read(self, size: int | None = -1) -> bytes:
+        """What is there of `size` bytes."""
+        found = super().read(size)
+        self._lacked = max((size or 0) - len(found), 0)
+        return found
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go back over what was read, when asked to go back over what the last read asked for."""
+        back, self._lacked = offset + self._lacked if whence == io.SEEK_CUR else offset, 0
+        return super().seek(back, whence)
 
 
 def _stated(value: object, default: float) -> float:

@@ -1,8 +1,10 @@
 """The version of this software as MAVLink tells it."""
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 
+@cache
 def software_version() -> str:
     """As text; empty where it is not installed."""
     try:

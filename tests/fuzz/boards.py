@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import cache
 
 import numpy as np
-from fuzz.wires import accounted, batches, drive, packed, unpacked
+from fuzz.wires import CUTS, accounted, batches, cut, drive, packed, unpacked
 from pty_board import BOARDS, moving
 
 from drivers import FrameDriver, make_emulator
@@ -19,7 +19,7 @@ from drivers.can.j1939 import J1939Imu
 from drivers.can.sbg import Sbg
 from drivers.can.xsens import Xsens
 from drivers.serial import mip
-from drivers.serial.chunks import fill_chunks, to_chunks
+from drivers.serial.chunks import SIZE, fill_chunks, to_chunks
 from drivers.serial.dialog import Dialog
 from drivers.serial.probe import hear, serial_drivers
 from drivers.serial.stream import ByteStream, Framing
@@ -113,10 +113,10 @@ def serial(name: str) -> Made:
         driver, size = make(), cuts(data)
         if data[:1] and data[0] & 1:
             body = mended(name, driver.board, body)
-        batch = frames(len(body) // size + 1)
+        batch = frames(CUTS + 1 + len(body) // SIZE)
         used = 0
-        for start in range(0, len(body), size):
-            used += fill_chunks(batch[used:], body[start : start + size], 1000 * start)
+        for piece in cut(len(body), size):
+            used += fill_chunks(batch[used:], body[piece], 1000 * piece.start)
         drive(driver, batch[:used], 64 if data[:1] and data[0] & 2 else 8)
         stream, count = ByteStream(driver.board), driver.counters
         assert count.samples + count.foreign + count.short + count.duplicated <= driver.stream.packets

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from fuzz.wires import cut
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from drivers.can.aiding import AidingEncoder
@@ -82,7 +83,7 @@ def mavlink() -> tuple[Callable[[bytes], None], list[bytes]]:
             pieces = [body[a:b] for a, b in pairwise(starts) if b > a]
         else:
             size = 1 + (how >> 2) * 8
-            pieces = [body[k : k + size] for k in range(0, len(body), size)]
+            pieces = [body[piece] for piece in cut(len(body), size)]
         encoder = AidingEncoder()
 
         def relay(rows: Any) -> None:

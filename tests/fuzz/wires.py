@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from functools import reduce
+from itertools import pairwise
 from operator import or_
 from typing import Any
 
@@ -12,6 +13,8 @@ from drivers import FrameDriver
 from drivers.can.frames import FRAME, FrameArray, frames
 from nav.increments import IntArray, Validity
 
+CUTS = 12
+"""Most pieces an input is cut into, its rest aside: how many more there are shows nothing new and takes most of the time."""
 TICK_NS = 10_000
 """Unit of the delay before a frame, in the reserved bytes of its record."""
 _VALID = int(reduce(or_, Validity))
@@ -35,10 +38,15 @@ def unpacked(data: bytes, size: int) -> FrameArray:
     return batch
 
 
+def cut(length: int, size: int) -> Iterator[slice]:
+    """`CUTS` pieces of `size` out of `length`, and the rest."""
+    edges = [*range(0, length, size)[: CUTS + 1], length]
+    return (slice(*edge) for edge in pairwise(edges))
+
+
 def batches(batch: FrameArray, size: int) -> Iterator[FrameArray]:
-    """`batch` in pieces of `size`."""
-    for start in range(0, len(batch), size):
-        yield batch[start : start + size]
+    """`batch` in pieces of `size`, and the rest."""
+    return (batch[piece] for piece in cut(len(batch), size))
 
 
 def drive(driver: FrameDriver, batch: FrameArray, size: int) -> None:

@@ -1,10 +1,12 @@
 """`hil navigate`: files in and out to the last bit, errors that name the place, and the analytic flight navigated."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 
+from hil.aid_file import AID_HEADER, read_aiding
 from hil.offline import IMU_HEADER, NAV_HEADER, navigate, read_init, thin
 from hil.scenario import load
 from hil.tables import read_table, write_table
@@ -111,6 +113,24 @@ def test_columns_of_unequal_length(tmp_path):
     np.savez(tmp_path / "short.npz", **{**columns, "dvel_z": ROWS[:2, 6]})
     with pytest.raises(HilError, match=r"short\.npz"):
         read_table(tmp_path / "short.npz", IMU_HEADER)
+
+
+def test_archives_that_are_none_or_damaged(tmp_path):
+    """A bare array, and members that zipfile refuses in ways of its own; tables and measurements."""
+    path = tmp_path / "odd.npz"
+    with path.open("wb") as file:
+        np.save(file, ROWS)
+    for read in (partial(read_table, header=IMU_HEADER), read_aiding):
+        with pytest.raises(HilError, match=r"odd\.npz: .*no archive of columns"):
+            read(path)
+    for header, read in ((IMU_HEADER, partial(read_table, header=IMU_HEADER)), (AID_HEADER, read_aiding)):
+        np.savez(path, **{name: np.ones(3) for name in header})
+        whole = bytearray(path.read_bytes())
+        at = whole.index(b"PK\1\2")
+        for place, value in ((at + 8, 1), (at + 10, 99)):  # encrypted; packed in a way that is unknown
+            path.write_bytes(whole[:place] + bytes([value]) + whole[place + 1 :])
+            with pytest.raises(HilError, match=r"odd\.npz: not a readable \.npz file"):
+                read(path)
 
 
 def test_archives_that_lack_something(tmp_path):

@@ -145,6 +145,17 @@ def base(n=500, mag=-2000, baro=-5000):
     return {("sensor_combined", 0): imu, ("vehicle_attitude", 0): attitude}
 
 
+def test_a_log_may_end_anywhere(tmp_path):
+    """Within the definitions too, and within a message of no known kind there, as long as all that was before it."""
+    whole = made(tmp_path / "cut.ulg", base(3)).read_bytes()
+    places = range(whole.index(b"Fsensor_combined"), whole.index(b"D\0\0") + 1)
+    for end in places:
+        for tail in (b"", struct.pack("<HB", end + 1 - 16, 0)):
+            (tmp_path / "cut.ulg").write_bytes(whole[:end] + tail)
+            with pytest.raises(HilError, match=r"cut\.ulg"):
+                read_ulog(tmp_path / "cut.ulg")
+
+
 def test_old_logs_carry_field_and_height_with_the_samples(tmp_path):
     log = read_ulog(made(tmp_path / "old.ulg", base(), EKF2_BARO_NOISE=2.0, EKF2_BARO_DELAY=30.0))
     lasting = np.sqrt(2.0 * IRON_S / 0.02)  # an error that lasts, at 50 Hz
