@@ -12,6 +12,7 @@ frames too, each in a ring of its sender's, and are recorded like those of the b
 import gc
 import hashlib
 import math
+import os
 import signal
 import time
 from dataclasses import dataclass, field, replace
@@ -37,7 +38,7 @@ from hil.health import HEALTH, HealthWriter
 from hil.lane import DECODED, DONE, OTHER, Lane
 from hil.magnetometer import correct
 from hil.other_attitude import Estimator, OtherAttitude
-from hil.realtime import claim, rest
+from hil.realtime import SharedProcessor, claim, doze, rest, wake_in_time
 from hil.reference import Reference, Trace
 from hil.ring import Ring
 from hil.scenario import Scenario
@@ -503,7 +504,7 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
                 loop.navigator.tell(0.0, "warning", lack)
             outlets.control.loop_begins()
             stats["phase"] = Phase.READY
-            _run(loop, source, order, outlets, looks=granted is not None and granted.processor >= 0 and source.live)
+            _run(loop, source, order, outlets, alone=granted is not None and granted.processor >= 0)
         finally:
             source.close()
         result = loop.result() | {"overflowed": source.overflowed}
@@ -524,7 +525,11 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
         answer.close()
 
 
-def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, looks: bool) -> None:
+def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, alone: bool) -> None:
+    looks = source.live and (alone or len(os.sched_getaffinity(0)) > 1)
+    processor = SharedProcessor()
+    if looks:
+        wake_in_time()
     batch = frames(BATCH)
     views = Cut[FrameArray](lambda n: batch[:n])
     silence_ns = round(order.scenario.navigation.silence_s * 1e9)
@@ -537,7 +542,10 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, look
     while not (control.stop or loop.finished or source.exhausted):
         if outlets.gate is not None:
             outlets.gate.wait(outlets.states, outlets.states.capacity // 2, lambda: control.stop)
-        n = source.receive(batch, 0.0 if look_until and time.monotonic_ns() < look_until else wait)
+        looking = look_until > 0 and time.monotonic_ns() < look_until
+        if looking and not alone:
+            processor.give_way()
+        n = source.receive(batch, 0.0 if looking else wait)
         woken_ns, now = time.time_ns(), time.monotonic_ns()
         if n:
             taken, samples = views[n], loop.samples
@@ -575,7 +583,8 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, look
             _record(event_record(event, time.time_ns()), outlets, order.paced)
             loop.obey(event)
         if looks and heard == now:
-            look_until = rest(loop.driver.period_s)
+            watched = source.watched if processor.is_free else ()
+            look_until = rest(loop.driver.period_s) if alone else doze(watched, now, loop.driver.period_s)
     if outlets.gate is not None:
         outlets.gate.wait(outlets.states, 0, lambda: control.stop)
 

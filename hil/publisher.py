@@ -30,6 +30,7 @@ from hil.clock import clock_reading
 from hil.control import Control
 from hil.geoid import undulation
 from hil.link_stats import LinkStats
+from hil.realtime import SharedProcessor
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
 from hil.stats import Stats
@@ -137,7 +138,7 @@ class _Publisher:
 
     def __init__(self, taps: Taps, station: Station, hub: Hub) -> None:
         self._ring, self._wake, self._control = taps.states, taps.states.wakes[taps.reader], taps.control
-        self._stats, self._looks = taps.stats, taps.looks
+        self._stats, self._looks, self._processor = taps.stats, taps.looks, SharedProcessor()
         self._links, self._told_s = taps.links, -math.inf
         self._station, self._hub = station, hub
         station.on_attitude = self._attitude_sent
@@ -221,8 +222,10 @@ class _Publisher:
             self._links.tell(self._hub.tallies())
         if self._hungry() and self._ring.count - self._seen != 1 and now_s - self._read_s > _COLD_S:
             self._rehearse()
-        slow = self._ring.count - self._seen == 1  # do not wait for its next solution
-        if self._hungry() and (slow or (self._looks and self._look())):
+        fresh = self._ring.count - self._seen
+        slow = fresh == 1  # do not wait for its next solution
+        looks = self._looks and self._processor.is_free and fresh * _LOOK_S >= now_s - self._read_s  # they come quickly
+        if self._hungry() and (slow or (looks and self._look())):
             now_s = time.monotonic()
             self._read(now_s)
             next_s = self._poll(now_s)
@@ -232,8 +235,8 @@ class _Publisher:
     def _look(self) -> bool:
         """Whether the next solution comes within `_LOOK_S`, while nobody else wants this processor."""
         newest, until = self._ring.count, time.monotonic() + _LOOK_S
-        while self._ring.count == newest and time.monotonic() < until:
-            os.sched_yield()
+        while self._ring.count == newest and time.monotonic() < until and self._processor.is_free:
+            self._processor.give_way()
         return self._ring.count != newest
 
     def _hungry(self) -> bool:

@@ -191,7 +191,7 @@ class Session:
             self._window.socket.close()  # the port lives as long as its process
         if self._publish and scenario.mavlink.links:
             network, early = outlets.aiding[0] if self.order.live else None, scenario.navigation.aligned_by_aiding
-            looks = self.order.realtime and self.order.live and len(os.sched_getaffinity(0)) > 1
+            looks = self.order.live and len(os.sched_getaffinity(0)) > 1
             shared = outlets.stats, outlets.fixes, self.links, looks
             taps = Taps(outlets.states, 0, outlets.events, outlets.control, network, early, *shared)
             launch("publisher", run_publisher, scenario.mavlink, taps, self._publisher_stop)

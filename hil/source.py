@@ -1,7 +1,7 @@
 """Where the loop's frames come from: a bus or a recording, behind the same `receive`."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,6 +26,10 @@ class Source(Protocol):
     """Arrival times are those of the host now: silence and latency mean something."""
     exhausted: bool
     """Nothing more will come."""
+
+    @property
+    def watched(self) -> Sequence[int]:
+        """The descriptor that is readable when frames wait; empty where there is none."""
 
     @property
     def trouble(self) -> str:
@@ -61,6 +65,12 @@ class BusSource:
     def trouble(self) -> str:
         """See `Source.trouble`."""
         return getattr(self._port, "trouble", "")
+
+    @property
+    def watched(self) -> Sequence[int]:
+        """See `Source.watched`."""
+        fileno: Callable[[], int] = getattr(self._port, "fileno", lambda: -1)
+        return [fd] if (fd := fileno()) >= 0 else []
 
     def receive(self, batch: FrameArray, timeout: float) -> int:
         """See `Source.receive`."""
@@ -106,6 +116,7 @@ class FileSource:
         Hand frames out at the times at which they were recorded; else as fast as they are asked for.
     """
 
+    watched: Sequence[int] = ()
     trouble = ""
     overflowed = 0
     refused: Mapping[str, int] = {}

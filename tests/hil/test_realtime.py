@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mav
 from hil.bridge import LoopOrder
 from hil.publisher import LOOP_DIED
 from hil.pytest_plugin import StartBridge
-from hil.realtime import PRIORITY, REST, refused, rest
-from hil.ring import Shared
+from hil.realtime import LEAD_S, PRIORITY, REST, doze, refused, rest
+from hil.ring import Shared, Wake
 from hil.scenario import Scenario
 from hil.session import STOPPED_S, Session, simulated_head
 from hil.stats import BINS, Stats, Times
@@ -183,8 +183,9 @@ def processor_time_s(pid: int) -> float:
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) == 1, reason="one processor: the loop has none for itself")
-def test_a_loop_that_looks_for_samples_rests_when_none_come(hil_bridge: StartBridge) -> None:
-    bridge = hil_bridge(navigation=TRUTH, head={"rate_hz": 1000}, realtime=True)
+@pytest.mark.parametrize("realtime", [True, False])
+def test_a_loop_that_looks_for_samples_rests_when_none_come(hil_bridge: StartBridge, *, realtime: bool) -> None:
+    bridge = hil_bridge(navigation=TRUTH, head={"rate_hz": 1000}, realtime=realtime)
     bridge.wait_mode("navigate")
     loop = pid_of(bridge.session, "loop")
 
@@ -218,6 +219,9 @@ def test_what_takes_a_sample_alone_is_ready_before_the_first(layout: str) -> Non
 @pytest.mark.parametrize("period_s", [None, 1e-4, 4.9e-4])
 def test_looking_does_not_pay_before_the_period_is_known_or_where_there_is_no_rest(period_s: float | None) -> None:
     assert rest(period_s) == 0
+    wake = Wake()
+    assert doze([wake.fileno()], time.monotonic_ns(), period_s) == 0
+    assert doze([], time.monotonic_ns(), 0.02) == 0, "nothing to look at"
 
 
 def test_a_rest_is_a_part_of_the_period() -> None:
@@ -225,6 +229,35 @@ def test_a_rest_is_a_part_of_the_period() -> None:
     until = rest(0.02)
     assert time.monotonic_ns() - before >= REST * 0.02e9
     assert 0.04e9 <= until - before < 0.05e9
+
+
+def test_a_doze_ends_before_the_next_sample_or_with_it() -> None:
+    wake, heard = Wake(), time.monotonic_ns()
+    until = doze([wake.fileno()], heard, 0.02)
+    assert time.monotonic_ns() - heard >= 0.02e9 - LEAD_S * 1e9
+    assert until == heard + round(0.02e9) + round(LEAD_S * 1e9)
+    wake.call()
+    heard = time.monotonic_ns()
+    assert doze([wake.fileno()], heard, 5.0) == 0
+    assert time.monotonic_ns() - heard < 2.5e9
+
+
+def test_a_processor_that_the_busy_want_is_not_looked_on() -> None:
+    """Two processes that never rest on one processor; then one alone."""
+    asks = (
+        "import os, subprocess, sys, time; from hil.realtime import SharedProcessor\n"
+        "os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])\n"
+        "other = subprocess.Popen([sys.executable, '-c', 'while True: pass'])\n"
+        "processor, until = SharedProcessor(), time.monotonic() + 60.0\n"
+        "while processor.is_free and time.monotonic() < until:\n"
+        "    processor.give_way()\n"
+        "assert not processor.is_free\n"
+        "other.kill(); other.wait()\n"
+        "while not processor.is_free and time.monotonic() < until:\n"
+        "    time.sleep(0.01)\n"
+        "assert processor.is_free"
+    )
+    subprocess.run([sys.executable, "-c", asks], check=True, timeout=120)
 
 
 def test_an_overrun_is_a_round_longer_than_its_samples(hil_bridge: StartBridge) -> None:
