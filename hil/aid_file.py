@@ -60,7 +60,7 @@ def read_aiding(path: Path) -> AidingArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(AID_HEADER)}") from error
-    except (ValueError, csv.Error) as error:  # no text, archive or table
+    except (ValueError, NotImplementedError, csv.Error) as error:  # no text, archive or table
         raise HilError(f"{path}: {error}") from error
     if not lines:
         raise HilError(f"{path}: no rows")

@@ -542,7 +542,7 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, alon
     while not (control.stop or loop.finished or source.exhausted):
         if outlets.gate is not None:
             outlets.gate.wait(outlets.states, outlets.states.capacity // 2, lambda: control.stop)
-        looking = look_until > 0 and time.monotonic_ns() < look_until
+        looking = time.monotonic_ns() < look_until
         if looking and not alone:
             processor.give_way()
         n = source.receive(batch, 0.0 if looking else wait)
@@ -583,8 +583,11 @@ def _run(loop: Loop, source: Source, order: LoopOrder, outlets: Outlets, *, alon
             _record(event_record(event, time.time_ns()), outlets, order.paced)
             loop.obey(event)
         if looks and heard == now:
-            watched = source.watched if processor.is_free else ()
-            look_until = rest(loop.driver.period_s) if alone else doze(watched, now, loop.driver.period_s)
+            period_s = loop.driver.period_s
+            if alone:
+                look_until = rest(period_s)
+            else:
+                look_until = doze(source.watched, now, period_s) if processor.is_free else 0
     if outlets.gate is not None:
         outlets.gate.wait(outlets.states, 0, lambda: control.stop)
 

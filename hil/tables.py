@@ -25,7 +25,7 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
     suffix = path.suffix.lower()
     try:
         if suffix == ".npz":
-            table = np.stack([column.astype(float) for column in archived(path, header)], axis=1)
+            table = np.stack([np.asarray(column, float) for column in archived(path, header)], axis=1)
         elif suffix == ".parquet":
             frame = parquet().read_table(path, columns=list(header))
             table = np.stack([np.asarray(frame[name].to_numpy(), float) for name in header], axis=1)
@@ -35,7 +35,7 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(header)}") from error
-    except ValueError as error:  # not text, unequal columns
+    except (ValueError, NotImplementedError) as error:  # not text, unequal columns, what pyarrow cannot read
         raise HilError(f"{path}: {error}") from error
     if len(table) == 0:
         raise HilError(f"{path}: no rows")

@@ -81,7 +81,7 @@ def watched(name: str, runs: int, seconds: int) -> tuple[int, int, str]:
 
 def whole(name: str, runs: int, seconds: int) -> str:
     """Fuzz one target, with its row of the page kept up to date; the outcome."""
-    began, inputs, most, outcome = time.monotonic(), 0, 0, "ok"
+    began, spent, inputs, most, outcome = time.monotonic(), 0, 0, 0, "ok"
     while outcome == "ok" and inputs < runs:
         spent = round(time.monotonic() - began)
         if seconds and spent >= seconds:
