@@ -35,7 +35,7 @@ def read_table(path: Path, header: tuple[str, ...]) -> FloatArray:
         raise HilError(f"{path}: {error.strerror or error}") from error
     except KeyError as error:
         raise HilError(f"{path}: no column {error}; expected {', '.join(header)}") from error
-    except (ValueError, NotImplementedError) as error:  # not text, unequal columns, what pyarrow cannot read
+    except (ValueError, TypeError, NotImplementedError) as error:  # not text, unequal columns, no numbers in Parquet
         raise HilError(f"{path}: {error}") from error
     if len(table) == 0:
         raise HilError(f"{path}: no rows")

@@ -133,6 +133,14 @@ def test_archives_that_are_none_or_damaged(tmp_path):
                 read(path)
 
 
+def test_parquet_of_no_numbers(tmp_path):
+    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    column = arrow.array([{"a": 1.0}] * 3)
+    parquet.write_table(arrow.table(dict.fromkeys(IMU_HEADER, column)), tmp_path / "odd.parquet")
+    with pytest.raises(HilError, match=r"odd\.parquet"):
+        read_table(tmp_path / "odd.parquet", IMU_HEADER)
+
+
 def test_archives_that_lack_something(tmp_path):
     columns = {name: ROWS[:, k] for k, name in enumerate(IMU_HEADER[:-1])}
     np.savez(tmp_path / "lacks.npz", **columns)
