@@ -6,19 +6,26 @@ from typing import Any, TypeVar
 import numba
 from numba.extending import intrinsic
 
+from nav.kernel_cache import KernelCache
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def kernel(function: F) -> F:
     """Compile `function` with numba: cached on disk, no GIL, IEEE arithmetic (no fast-math), division by zero as in numpy."""
-    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return compiled
+    return _compiled(function)
 
 
 def inline_kernel(function: F) -> F:
     """Compile a small helper that is inlined into the kernels calling it (LLVM decides)."""
-    compiled: F = numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)(function)
-    return compiled
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: F, **options: bool) -> F:
+    compiled: Any = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    compiled._cache = KernelCache(function)  # as its `enable_caching` does with numba's own
+    kept: F = compiled
+    return kept
 
 
 @intrinsic  # type: ignore[untyped-decorator]
