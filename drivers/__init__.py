@@ -5,7 +5,8 @@ A board is one module with one class that satisfies `FrameDriver`, found by the 
 
 from dataclasses import dataclass
 from importlib.metadata import entry_points
-from typing import Protocol
+from inspect import signature
+from typing import Any, Protocol
 
 from drivers.can.frames import FrameArray
 from nav.errors import HilError
@@ -106,16 +107,16 @@ def make_driver(name: str) -> FrameDriver:
         No driver of that name; names what there is. Or the driver refuses what follows ``@``.
     """
     bare, at, option = name.partition("@")
-    for point in entry_points(group="dtg_hil.drivers"):
-        if point.name == bare:
-            try:
-                driver: FrameDriver = point.load()(*([option] if at else []))
-            except TypeError as error:
-                if not at:
-                    raise
-                raise HilError(f"driver {bare!r} takes no option: leave @{option} out") from error
-            return driver
-    raise HilError(f"no driver {bare!r}; there is: {', '.join(driver_names())}")
+    kind = _found("dtg_hil.drivers", bare)
+    if kind is None:
+        raise HilError(f"no driver {bare!r}; there is: {', '.join(driver_names())}")
+    if not at:
+        driver: FrameDriver = kind()
+    elif signature(kind).parameters:
+        driver = kind(option)
+    else:
+        raise _refused(bare, option)
+    return driver
 
 
 def make_emulator(name: str, period_us: int) -> BoardEmulator:
@@ -127,16 +128,24 @@ def make_emulator(name: str, period_us: int) -> BoardEmulator:
         The board cannot be emulated; names those that can. Or it has no such period, or takes no option.
     """
     bare, at, option = name.partition("@")
-    for point in entry_points(group="dtg_hil.emulators"):
-        if point.name == bare:
-            try:
-                emulator: BoardEmulator = point.load()(period_us, **({"option": option} if at else {}))
-            except TypeError as error:
-                if not at:
-                    raise
-                raise HilError(f"driver {bare!r} takes no option: leave @{option} out") from error
-            return emulator
-    raise HilError(f"no emulator of {name!r}; there is: dtg-head, {', '.join(emulator_names())}")
+    kind = _found("dtg_hil.emulators", bare)
+    if kind is None:
+        raise HilError(f"no emulator of {name!r}; there is: dtg-head, {', '.join(emulator_names())}")
+    if not at:
+        emulator: BoardEmulator = kind(period_us)
+    elif "option" in signature(kind).parameters:
+        emulator = kind(period_us, option=option)
+    else:
+        raise _refused(bare, option)
+    return emulator
+
+
+def _found(group: str, name: str) -> Any:
+    return next((point.load() for point in entry_points(group=group) if point.name == name), None)
+
+
+def _refused(name: str, option: str) -> HilError:
+    return HilError(f"driver {name!r} takes no option: leave @{option} out")
 
 
 def _names(group: str) -> list[str]:

@@ -20,13 +20,14 @@ from drivers.can.aiding import AidingEncoder, is_aiding, merge
 from drivers.can.bus import Port, open_port
 from drivers.can.dtg_head_emulator import SIMULATED, HeadEncoder
 from drivers.can.frames import FrameArray, frames
+from drivers.serial.chunks import is_chunk
 from drivers.serial.pty import PtyPort
 from hil.control import Control
 from hil.pacing import Pacer
 from hil.scenario import Scenario
 from hil.stats import Stats
 from hil.warmup import warm_head
-from hil.wire_config import check_board
+from hil.wire_config import SERIAL, check_board
 from hil.world.aiding import SimulatedAiding
 from hil.world.faults import Wire
 from hil.world.injection import Injection
@@ -61,6 +62,11 @@ class SimulatedHead:
             rotor_hz=head.rotor.spin_hz,
         )
         check_board(scenario.driver, scenario.bus, scenario.wire)
+        if scenario.bus.startswith(("pty:", "serial:")) and not _sends_bytes(scenario, self.period_us):
+            raise HilError(
+                f"a {scenario.driver} sends CAN frames, and {scenario.bus} is a serial line: give a CAN bus, "
+                f"or a board of a serial port in the scenario: driver = {' | '.join(map(repr, SERIAL))}"
+            )
         self.wire = Wire(scenario, self.period_us, self.frames_per_sample) if scenario.wire else None
         self.injection: Injection | None = None
         """Faults that it is told to have while it runs."""
@@ -123,6 +129,22 @@ def board_of(scenario: Scenario, period_us: int) -> BoardEmulator:
             f"an emulated {scenario.driver} has ideal instruments: leave head.instruments and head.faults out"
         )
     return make_emulator(scenario.driver, period_us)
+
+
+def _sends_bytes(scenario: Scenario, period_us: int) -> bool:
+    """Whether it is a board of a serial port, by its first sample."""
+    if scenario.driver == "dtg-head":
+        return False
+    still = np.zeros((1, 3))
+    imu = ImuIncrements(
+        np.full(1, 1e-6 * period_us),
+        np.full(1, 1e-6 * period_us),
+        still,
+        still,
+        np.zeros(1, np.uint8),
+        np.zeros(1, np.int64),
+    )
+    return bool(is_chunk(board_of(scenario, period_us).samples(imu)).any())
 
 
 def stream(head: SimulatedHead, port: Port, samples: int | None, *, paced: bool, cancelled: Callable[[], bool]) -> int:

@@ -198,3 +198,7 @@ def test_what_cannot_be_is_refused() -> None:
         SimulatedHead(scenario({"kind": "crc-off", "at_s": 1.0}, driver="sbg"))
     with pytest.raises(HilError, match=r"only a port can be pulled out: hil imu SCENARIO --bus pty:PATH"):
         SimulatedHead(scenario({"kind": "unplugged", "at_s": 1.0}))
+    for bus in ("pty:/tmp/x", "serial:/dev/x:115200"):
+        for driver in ("dtg-head", "j1939-imu"):
+            with pytest.raises(HilError, match=f"a {driver} sends CAN frames, and {bus} is a serial line.*'vectornav'"):
+                SimulatedHead(scenario(driver=driver).with_changes(bus=bus))
