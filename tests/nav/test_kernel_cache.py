@@ -103,6 +103,7 @@ def test_a_change_in_another_file_is_seen(modules: Path, old: str, new: str, exp
     assert answer(modules, "outer.py") == [expected, 1]
 
 
+@pytest.mark.slow
 def test_two_processes_compile_two_signatures_at_once(tmp_path: Path) -> None:
     (tmp_path / "first.py").write_text(FIRST)
     (tmp_path / "race.py").write_text(RACE)
