@@ -2,10 +2,11 @@
 
 The next sample or a later one is taken, and what is missing is counted as lost: by the counter, whose turns the clock
 resolves, or by the clock alone. The same sample again is a duplicate, one that was counted as lost comes late. A counter
-that stands still while time goes on is frozen; where it goes on and time jumps, the clock was set. Without a counter a
-jump ahead is told from a gap by the arrivals (:mod:`drivers.serial.lead`). One that fits neither counter nor clock is set
-aside: when the next one continues it, the board started anew; else it was damage that its check did not show, or
-another board on the wire, and counts as `crc_errors`.
+that stands still while time goes on is frozen; where it goes on and time jumps, the clock was set, unless time jumps by
+as much again: then it is the rate that was changed. Without a counter a jump ahead is told from a gap by the arrivals
+(:mod:`drivers.serial.lead`). One that fits neither counter nor clock is set aside: when the next one continues it, the
+board started anew, maybe at another rate; else it was damage that its check did not show, or another board on the wire,
+and counts as `crc_errors`.
 """
 
 from drivers import Counters
@@ -42,6 +43,8 @@ class Timeline:
         self._lead = Lead()
         self._seen = _ALL
         """Bit k: the sample k before the newest was there, or was never missed."""
+        self._pace = 0
+        """Time for each number of the counter up to the last sample, where it did not fit the period; else 0."""
         self.period_ns = 0
         """Between the last two samples that followed each other; 0 while unknown."""
         self.time_ns = 0
@@ -69,7 +72,12 @@ class Timeline:
         by_arrival = (
             steps > 1 and not self._turn and self._lead.leaps(self.time_ns + elapsed, arrival_ns, steps, period)
         )
-        if by_counter or by_arrival:
+        pace = elapsed // number if by_counter and 0 < elapsed <= LONGEST_NS else 0
+        slowed = pace > 0 and abs(pace - self._pace) <= pace // 8
+        self._pace = pace
+        if slowed:
+            steps, self.period_ns = number, pace
+        elif by_counter or by_arrival:
             self._counters.clock_steps += 1
             steps = max(number, 1)
             elapsed = steps * period
@@ -121,7 +129,7 @@ class Timeline:
         self._counters.restarts += 1
         self._counters.lost += 1  # the one that was set aside
         self._last, self._aside, self._seen, self._lead = self._aside, None, _ALL, Lead()
-        self.time_ns = self._last[0]
+        self.time_ns, self.period_ns = self._last[0], 0  # what starts anew may have another rate
         self.sequence += 1  # with this one's a jump: the navigator sees that time does not go on
         return self.place(*here, said_ns, arrival_ns)
 

@@ -86,3 +86,29 @@ def test_arrivals_that_say_nothing_leave_a_leap_a_gap(tick_ns: int) -> None:
     for at, k in enumerate([*range(300), *range(800, 1000)]):
         timeline.place(10_000_000 * k, 0, 10_000_000, tick_ns * at)
     assert (counters.lost, counters.clock_steps) == (500, 0)
+
+
+@pytest.mark.parametrize("turn", [0, 1 << 16])
+@pytest.mark.parametrize("later_ns", [PERIOD_NS // 4, PERIOD_NS, 4 * PERIOD_NS])
+def test_a_board_that_comes_back_at_another_rate(turn: int, later_ns: int) -> None:
+    """The steps behind a new start are those of the new rate, from the first on."""
+    counters = Counters()
+    timeline = Timeline(counters, 1 << 64, turn)
+    for k in range(100):
+        timeline.place(10**12 + k * PERIOD_NS, 5000 + k if turn else 0)
+    steps = [timeline.place(k * later_ns, k if turn else 0) for k in range(100)]
+    assert steps == [0] + [later_ns] * 99
+    assert (counters.restarts, counters.lost, counters.clock_steps) == (1, 1, 0)
+
+
+@pytest.mark.parametrize("times_slower", [0.25, 2, 4, 10])
+def test_a_rate_that_is_changed_while_the_counter_goes_on(times_slower: float) -> None:
+    """The first step that is much longer looks like a clock that was set; with the second it is the rate."""
+    counters, later_ns = Counters(), round(times_slower * PERIOD_NS)
+    timeline = Timeline(counters, 1 << 64, 1 << 16)
+    times = [*range(0, 100 * PERIOD_NS, PERIOD_NS), *(99 * PERIOD_NS + k * later_ns for k in range(1, 101))]
+    steps = [timeline.place(time, k) for k, time in enumerate(times) if k not in {110, 150, 151}]
+    assert steps[101:] == [later_ns] * 96
+    assert counters.clock_steps == (times_slower > 2)
+    assert counters.lost == 3
+    assert counters.restarts == counters.crc_errors == 0
