@@ -18,7 +18,7 @@ FRAMES = {
     "late": "samples come behind later ones",
     "crc_errors": "frames fail their check",
     "foreign": "frames of another sender",
-    "short": "frames have a wrong length",
+    "short": "frames have a wrong length or lack a value",
     "version_errors": "frames are of another protocol version",
     "frozen": "the counter of the samples stands still while their time goes on",
     "clock_steps": "the sensor's clock jumped and its samples went on: time goes on with them",

@@ -27,7 +27,8 @@ WRITE, READ = 0x01, 0x02
 """Function selectors."""
 _WEEK_NS = 604_800 * 10**9
 _LONGEST_STEP_NS = 100 * 10**9
-_VECTORS = {ACCELERATION, RATE, DELTA_THETA, DELTA_VELOCITY}
+_INCREMENTS = {DELTA_THETA, DELTA_VELOCITY}
+_VECTORS = {ACCELERATION, RATE, *_INCREMENTS}
 _OVERRANGED = 0x0077
 """Bits of the overrange status: axes of the accelerometer and of the gyro."""
 OUTPUTS = (REFERENCE_TIME, DELTA_THETA, DELTA_VELOCITY)
@@ -67,6 +68,10 @@ class Mip:
     clock_ns = 1 << 64
     turn = 0
 
+    def __init__(self) -> None:
+        self._uneven = False
+        """The last increment came alone, so the next two together are not of the same time."""
+
     def size(self, data: bytes, at: int) -> int:
         """See `Framing.size`."""
         if data[at + 1 : at + 2] not in {b"", SYNC[1:]}:
@@ -85,10 +90,13 @@ class Mip:
         if listed is None:
             return "short"
         fields = dict(listed)
-        coned = DELTA_THETA in fields and DELTA_VELOCITY in fields
-        turn, push = (DELTA_THETA, DELTA_VELOCITY) if coned else (RATE, ACCELERATION)
-        if turn not in fields and push not in fields:
+        if fields.keys().isdisjoint(_VECTORS):
             return "foreign"
+        both = fields.keys() >= _INCREMENTS
+        coned = both and not self._uneven
+        if not fields.keys().isdisjoint(_INCREMENTS):
+            self._uneven = not both
+        turn, push = (DELTA_THETA, DELTA_VELOCITY) if coned else (RATE, ACCELERATION)
         time_ns = _time_ns(fields)
         if time_ns is None or not {turn, push} <= fields.keys():
             return "short"

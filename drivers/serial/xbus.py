@@ -31,6 +31,8 @@ TICK_NS = 100_000
 """Of SampleTimeFine."""
 TEMPERATURE, COUNTER, TIME_FINE, STATUS = 0x0810, 0x1020, 0x1060, 0xE020
 DELTA_Q, DELTA_V, RATE, ACCELERATION = 0x8030, 0x4010, 0x8020, 0x4020
+_INCREMENTS = {DELTA_Q, DELTA_V}
+_VECTORS = {ACCELERATION, RATE, *_INCREMENTS}
 SIZE = 65
 """Bytes of the longest message that `configure` asks for."""
 _SELF_TEST, _CLIPPED = 0x01, 0x3F00
@@ -126,6 +128,8 @@ class Xbus:
 
     def __init__(self) -> None:
         self._said: dict[str, object] = {}
+        self._uneven = False
+        """The last increment came alone, so the next two together are not of the same time."""
 
     def size(self, data: bytes, at: int) -> int:
         """See `Framing.size`."""
@@ -154,10 +158,13 @@ class Xbus:
             self._said["temperature_c"] = fields[TEMPERATURE].values[0]
         status = int(fields[STATUS].values[0]) if STATUS in fields else _SELF_TEST
         self._said["status"] = status
-        coned = DELTA_Q in fields and DELTA_V in fields
-        turn, push = (DELTA_Q, DELTA_V) if coned else (RATE, ACCELERATION)
-        if turn not in fields and push not in fields:
+        if fields.keys().isdisjoint(_VECTORS):
             return "foreign"  # a packet of slower outputs
+        both = fields.keys() >= _INCREMENTS
+        coned = both and not self._uneven
+        if not fields.keys().isdisjoint(_INCREMENTS):
+            self._uneven = not both
+        turn, push = (DELTA_Q, DELTA_V) if coned else (RATE, ACCELERATION)
         if not {turn, push, COUNTER, TIME_FINE} <= fields.keys():
             return "short"
         if len(fields[turn].values) != (4 if coned else 3) or len(fields[push].values) != 3:
