@@ -1,21 +1,24 @@
 """The order of a board's samples, by its clock and, where it has one, its counter.
 
 The next sample or a later one is taken, and what is missing is counted as lost: by the counter, whose turns the clock
-resolves, or by the clock alone. The same sample again is a duplicate, one that was counted as lost comes late. A counter
-that stands still while time goes on is frozen; where it goes on and time jumps, the clock was set, unless time jumps by
-as much again: then it is the rate that was changed. Without a counter a jump ahead is told from a gap by the arrivals
-(:mod:`drivers.serial.lead`). One that fits neither counter nor clock is set aside: when the next one continues it, the
-board started anew, maybe at another rate; else it was damage that its check did not show, or another board on the wire,
-and counts as `crc_errors`.
+resolves, or by the clock alone. The same sample again is a duplicate, one that was counted as lost comes late; either is
+known by time and counter, or by a time on the grid of the samples. A counter that stands still while time goes on is
+frozen; where it goes on and time jumps, the clock was set, unless time jumps by as much again: then it is the rate that
+was changed. Without a counter a jump ahead is told from a gap by the arrivals (:mod:`drivers.serial.lead`). One that fits
+neither counter nor clock is set aside: when the next one continues it, the board started anew, maybe at another rate;
+else it was damage that its check did not show, or another board on the wire, and counts as `crc_errors`.
 """
 
 from drivers import Counters
 from drivers.serial.lead import Lead
 
 NEAR = 8
-"""Most samples that may be missing behind one that was set aside for it to count as continued, or the clock as set."""
+"""Most samples that may be missing behind one that was set aside for it to count as continued, or the clock as set.
+
+Also most duplicates in a row by which a board without a counter is not yet said to have set its clock back.
+"""
 WINDOW = 64
-"""How far back a sample counts as late."""
+"""How far back a sample counts as late or as a duplicate."""
 
 LONGEST_NS = 3_600_000_000_000
 """No gap is longer: a leap of the clock beyond it is damage, or a board that started anew."""
@@ -41,8 +44,12 @@ class Timeline:
         self._last: tuple[int, int] | None = None
         self._aside: tuple[int, int] | None = None
         self._lead = Lead()
-        self._seen = _ALL
-        """Bit k: the sample k before the newest was there, or was never missed."""
+        self._seen = 1
+        """Bit k: the sample k before the newest was there."""
+        self._first = 0
+        """Number of the sample with which the board started."""
+        self._again = 0
+        """Older ones that came once more since the newest sample."""
         self._pace = 0
         """Time for each number of the counter up to the last sample, where it did not fit the period; else 0."""
         self.period_ns = 0
@@ -59,7 +66,8 @@ class Timeline:
         """
         here = (time_ns, counter)
         if self._last is None:
-            self._last, self.time_ns, self.sequence = here, time_ns, counter
+            self._last, self.time_ns = here, time_ns
+            self.sequence = self._first = counter
             return said_ns
         elapsed = self._elapsed(time_ns, self._last[0])
         number = (counter - self._last[1]) % self._turn if self._turn else 0
@@ -86,7 +94,7 @@ class Timeline:
         if self._aside is not None:
             self._counters.crc_errors += 1
             self._aside = None
-        self._last = here
+        self._last, self._again = here, 0
         self.time_ns += elapsed
         self.sequence += steps
         self._seen = (self._seen << steps | 1) & _ALL if steps < WINDOW else 1
@@ -114,10 +122,18 @@ class Timeline:
         """Count one that does not go on; the step of one that continues what was set aside."""
         period = said_ns or self.period_ns
         back = round(-elapsed / period) if period else 0
-        if 0 < back < WINDOW and not self._seen >> back & 1 and (number + back) % (self._turn or back) == 0:
-            self._seen |= 1 << back
-            self._counters.late += 1
-            self._counters.lost -= 1
+        if self._turn:
+            agrees = (number + back) % self._turn == 0
+        else:  # many in a row are new samples of a clock that was set back
+            agrees = abs(elapsed + back * period) <= period // 8 and self._again < NEAR
+        if agrees and 0 < back < WINDOW and back <= self.sequence - self._first:
+            if self._seen >> back & 1:
+                self._counters.duplicated += 1
+                self._again += 1
+            else:
+                self._seen |= 1 << back
+                self._counters.late += 1
+                self._counters.lost -= 1
             return 0
         if self._turn and number == 0 and 0 < elapsed <= LONGEST_NS:
             self._counters.frozen += 1
@@ -128,9 +144,10 @@ class Timeline:
             return 0
         self._counters.restarts += 1
         self._counters.lost += 1  # the one that was set aside
-        self._last, self._aside, self._seen, self._lead = self._aside, None, _ALL, Lead()
+        self._last, self._aside, self._seen, self._lead = self._aside, None, 1, Lead()
         self.time_ns, self.period_ns = self._last[0], 0  # what starts anew may have another rate
         self.sequence += 1  # with this one's a jump: the navigator sees that time does not go on
+        self._first = self.sequence
         return self.place(*here, said_ns, arrival_ns)
 
     def _continues(self, here: tuple[int, int], before: tuple[int, int]) -> bool:

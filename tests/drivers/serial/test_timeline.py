@@ -112,3 +112,46 @@ def test_a_rate_that_is_changed_while_the_counter_goes_on(times_slower: float) -
     assert counters.clock_steps == (times_slower > 2)
     assert counters.lost == 3
     assert counters.restarts == counters.crc_errors == 0
+
+
+COUNTED = pytest.mark.parametrize("turn", [0, 1 << 16])
+
+
+def counted(turn: int, numbers: list[int], off_ns: int = 0, first: int = 65500) -> dict[str, int]:
+    """What is counted for samples with these numbers; those that come behind later ones are off by `off_ns`."""
+    counters, newest = Counters(), -1
+    timeline = Timeline(counters, 1 << 64, turn)
+    for k in numbers:
+        time_ns = 10**12 + k * PERIOD_NS + (off_ns if k < newest else 0)
+        timeline.place(time_ns, (first + k) % turn if turn else 0)
+        newest = max(newest, k)
+    return {name: count for name, count in counters.as_dict().items() if count}
+
+
+@COUNTED
+def test_older_packets_that_come_again_are_duplicates(turn: int) -> None:
+    assert counted(turn, [*range(100), 97, 98, 100, 40, 97, 101, 101, *range(102, 200)]) == {"duplicated": 5}
+
+
+@COUNTED
+def test_what_was_missing_is_late_once_and_then_a_duplicate(turn: int) -> None:
+    numbers = [*range(50), *range(55, 80), 52, 52, 54, 49, 55, *range(80, 100)]
+    assert counted(turn, numbers) == {"lost": 3, "late": 2, "duplicated": 3}
+
+
+@COUNTED
+@pytest.mark.parametrize("numbers", [[*range(10, 30), 5, *range(30, 40)], [*range(200), 120, *range(200, 210)]])
+def test_what_was_before_the_start_or_is_long_ago_is_no_duplicate(turn: int, numbers: list[int]) -> None:
+    assert counted(turn, numbers) == {"crc_errors": 1}
+
+
+def test_without_a_counter_an_older_one_must_lie_on_the_grid() -> None:
+    numbers = [*range(40), *range(45, 80), 60, 80, 42, *range(81, 100)]
+    assert counted(0, numbers, PERIOD_NS // 2) == {"lost": 5, "crc_errors": 2}
+
+
+@pytest.mark.parametrize("back", [20, 63])
+def test_a_clock_set_back_by_whole_steps_is_soon_told_from_packets_that_come_again(back: int) -> None:
+    told = counted(0, [*range(100), *range(100 - back, 300)])
+    assert told.pop("duplicated") < 10
+    assert told == {"restarts": 1, "lost": 1}
