@@ -123,20 +123,22 @@ class Mip:
         """See `Board.configure`: reference time, delta theta and delta velocity; the format is read back."""
         check_line(rate_hz, SIZE, baud)
         _ask(dialog, "set to idle", BASE, IDLE)
-        answer = _ask(dialog, "get base rate", DM3, BASE_RATE, bytes([SENSOR])).get(0x8E, b"")
-        base = struct.unpack(">H", answer[1:])[0] if len(answer) == 3 else 0
-        decimation = round(base / rate_hz) if rate_hz > 0 else 0
-        if decimation < 1 or decimation * rate_hz != base:
-            raise HilError(f"microstrain-mip: {rate_hz:g} Hz is not the board's {base} Hz by a whole number")
-        wanted = bytes([SENSOR, len(OUTPUTS)]) + b"".join(struct.pack(">BH", name, decimation) for name in OUTPUTS)
-        _ask(dialog, "message format", DM3, FORMAT, bytes([WRITE]) + wanted)
-        there = _ask(dialog, "read message format", DM3, FORMAT, bytes([READ, SENSOR])).get(0x8F, b"")
-        if there != wanted:
-            raise HilError(
-                f"microstrain-mip: the message format reads back as {there.hex()}: the board did not take it"
-            )
-        _ask(dialog, "data stream on", DM3, STREAM, bytes([WRITE, SENSOR, 1]))
-        _ask(dialog, "resume", BASE, RESUME)
+        try:
+            answer = _ask(dialog, "get base rate", DM3, BASE_RATE, bytes([SENSOR])).get(0x8E, b"")
+            base = struct.unpack(">H", answer[1:])[0] if len(answer) == 3 else 0
+            decimation = round(base / rate_hz) if rate_hz > 0 else 0
+            if decimation < 1 or decimation * rate_hz != base:
+                raise HilError(f"microstrain-mip: {rate_hz:g} Hz is not the board's {base} Hz by a whole number")
+            wanted = bytes([SENSOR, len(OUTPUTS)]) + b"".join(struct.pack(">BH", name, decimation) for name in OUTPUTS)
+            _ask(dialog, "message format", DM3, FORMAT, bytes([WRITE]) + wanted)
+            there = _ask(dialog, "read message format", DM3, FORMAT, bytes([READ, SENSOR])).get(0x8F, b"")
+            if there != wanted:
+                raise HilError(
+                    f"microstrain-mip: the message format reads back as {there.hex()}: the board did not take it"
+                )
+            _ask(dialog, "data stream on", DM3, STREAM, bytes([WRITE, SENSOR, 1]))
+        finally:  # also where it is refused: the board was stopped
+            _ask(dialog, "resume", BASE, RESUME)
         return {"rate_hz": base / decimation}
 
 

@@ -179,19 +179,21 @@ class VectorNav:
         """See `Board.configure`: registers 06 (no ASCII output), 82 (body axes, nothing taken off) and 75, which is read back."""
         check_line(rate_hz, SIZE, baud)
         _ask(dialog, "VNASY,0")
-        model = _ask(dialog, "VNRRG,01").split(",")[-1]
-        base = 400 if model.startswith("VN-3") else 800
-        divisor = round(base / rate_hz) if rate_hz > 0 else 0
-        if not (1 <= divisor <= base and math.isclose(divisor * rate_hz, base, rel_tol=1e-9)):
-            raise HilError(f"vectornav: {rate_hz:g} Hz is not {base} Hz of a {model} by a whole number")
-        _ask(dialog, "VNWRG,06,0")
-        _ask(dialog, "VNWRG,82,0,0,0,0,0")
-        _ask(dialog, f"VNWRG,75,{BOTH_PORTS},{divisor},{GROUPS:02X}," + ",".join(f"{mask:04X}" for mask in MASKS))
-        answer = _ask(dialog, "VNRRG,75").split(",")[2:]
-        there = [int(answer[0]), int(answer[1]), *(int(part, 16) for part in answer[2:])] if _is_75(answer) else []
-        if there != [BOTH_PORTS, divisor, GROUPS, *MASKS]:
-            raise HilError(f"vectornav: register 75 reads back as {','.join(answer)}: the board did not take it")
-        _ask(dialog, "VNASY,1")
+        try:
+            model = _ask(dialog, "VNRRG,01").split(",")[-1]
+            base = 400 if model.startswith("VN-3") else 800
+            divisor = round(base / rate_hz) if rate_hz > 0 else 0
+            if not (1 <= divisor <= base and math.isclose(divisor * rate_hz, base, rel_tol=1e-9)):
+                raise HilError(f"vectornav: {rate_hz:g} Hz is not {base} Hz of a {model} by a whole number")
+            _ask(dialog, "VNWRG,06,0")
+            _ask(dialog, "VNWRG,82,0,0,0,0,0")
+            _ask(dialog, f"VNWRG,75,{BOTH_PORTS},{divisor},{GROUPS:02X}," + ",".join(f"{mask:04X}" for mask in MASKS))
+            answer = _ask(dialog, "VNRRG,75").split(",")[2:]
+            there = [int(answer[0]), int(answer[1]), *(int(part, 16) for part in answer[2:])] if _is_75(answer) else []
+            if there != [BOTH_PORTS, divisor, GROUPS, *MASKS]:
+                raise HilError(f"vectornav: register 75 reads back as {','.join(answer)}: the board did not take it")
+        finally:  # also where it is refused: the board was stopped
+            _ask(dialog, "VNASY,1")
         return {"model": model, "rate_hz": base / divisor}
 
 

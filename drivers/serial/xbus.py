@@ -33,6 +33,8 @@ TEMPERATURE, COUNTER, TIME_FINE, STATUS = 0x0810, 0x1020, 0x1060, 0xE020
 DELTA_Q, DELTA_V, RATE, ACCELERATION = 0x8030, 0x4010, 0x8020, 0x4020
 _INCREMENTS = {DELTA_Q, DELTA_V}
 _VECTORS = {ACCELERATION, RATE, *_INCREMENTS}
+NO_RATE = 0xFFFF
+"""In the place of a rate: with each message, for counter, time and status; that it grants none, for increments."""
 SIZE = 65
 """Bytes of the longest message that `configure` asks for."""
 _SELF_TEST, _CLIPPED = 0x01, 0x3F00
@@ -185,20 +187,23 @@ class Xbus:
 
     def configure(self, dialog: Dialog, rate_hz: float, baud: int) -> dict[str, object]:
         """See `Board.configure`: counter, time, DeltaQ, DeltaV and status at `rate_hz`, temperature once a second."""
-        if not (rate_hz == int(rate_hz) and 1 <= rate_hz <= 0xFFFE):
-            raise HilError(f"xsens-xbus: {rate_hz:g} Hz is not a whole number of hertz")
+        if not (1 <= rate_hz < NO_RATE and rate_hz == int(rate_hz)):
+            raise HilError(f"xsens-xbus: {rate_hz:g} Hz is not a whole number of hertz from 1 to {NO_RATE - 1}")
         check_line(rate_hz, SIZE, baud)
         _ask(dialog, "GotoConfig", GOTO_CONFIG)
-        device = payload(_ask(dialog, "ReqDID", REQUEST_ID))
-        wanted = [(COUNTER, 0xFFFF), (TIME_FINE, 0xFFFF), (STATUS, 0xFFFF), (TEMPERATURE, 1)]
-        wanted += [(DELTA_Q, int(rate_hz)), (DELTA_V, int(rate_hz))]
-        order = b"".join(struct.pack(">HH", *entry) for entry in wanted)
-        answer = payload(_ask(dialog, "SetOutputConfiguration", SET_OUTPUT, order))
-        granted = dict(struct.iter_unpack(">HH", answer)) if len(answer) % 4 == 0 else {}
-        for name in (DELTA_Q, DELTA_V):
-            if granted.get(name) != int(rate_hz):
-                raise HilError(f"xsens-xbus: asked for {rate_hz:g} Hz, the board grants {granted.get(name, 0)} Hz")
-        _ask(dialog, "GotoMeasurement", GOTO_MEASUREMENT)
+        try:
+            device = payload(_ask(dialog, "ReqDID", REQUEST_ID))
+            wanted = [(COUNTER, NO_RATE), (TIME_FINE, NO_RATE), (STATUS, NO_RATE), (TEMPERATURE, 1)]
+            wanted += [(DELTA_Q, int(rate_hz)), (DELTA_V, int(rate_hz))]
+            order = b"".join(struct.pack(">HH", *entry) for entry in wanted)
+            answer = payload(_ask(dialog, "SetOutputConfiguration", SET_OUTPUT, order))
+            granted = dict(struct.iter_unpack(">HH", answer)) if len(answer) % 4 == 0 else {}
+            for name in (DELTA_Q, DELTA_V):
+                if (rate := granted.get(name, NO_RATE)) != int(rate_hz):
+                    said = "none" if rate == NO_RATE else f"{rate} Hz"
+                    raise HilError(f"xsens-xbus: asked for {rate_hz:g} Hz, the board grants {said}: take another rate")
+        finally:  # also where it is refused: the board was stopped
+            _ask(dialog, "GotoMeasurement", GOTO_MEASUREMENT)
         return {"device_id": device.hex().upper(), "rate_hz": rate_hz}
 
 

@@ -299,6 +299,11 @@ def test_configured_on_a_real_port(name: str, tmp_path: Path) -> None:
         assert emulator.measuring
         with pytest.raises(HilError, match=r"not the|not 800|grants|whole number"):
             set_up(name, url, 100.5 if name == "xsens-xbus" else 333.0)
+        assert emulator.measuring, "what is refused leaves no board silent"
+        for rate in (float("inf"), float("nan"), 0.0, -100.0):
+            with pytest.raises(HilError):
+                set_up(name, url, rate)
+        assert emulator.measuring
         with pytest.raises(HilError, match="baud"):
             set_up(name, url.replace("921600", "9600"), 100.0)
 

@@ -112,12 +112,14 @@ def test_a_register_that_does_not_stick(tmp_path: Path) -> None:
         def _answer(self, text: str) -> str:
             return "VNRRG,75,2,8,01,0029" if text == "VNRRG,75" else super()._answer(text)
 
+    emulator = Stubborn()
     with (
-        Plugged(Stubborn(), tmp_path / "imu"),
+        Plugged(emulator, tmp_path / "imu"),
         closing(SerialPort(f"serial:{tmp_path / 'imu'}:921600")) as port,
         pytest.raises(HilError, match="did not take it"),
     ):
         VectorNav().configure(Dialog(port, VectorNav()), 200.0, port.baud)
+    assert emulator.measuring
 
 
 def test_the_configured_packet_is_the_emulators() -> None:

@@ -190,8 +190,9 @@ def test_a_rate_that_the_board_does_not_grant(tmp_path: Path) -> None:
         said = Xbus().configure(Dialog(port, Xbus()), 400.0, port.baud)
         assert said["device_id"] == "0123ABCD"
         assert {xbus.DELTA_Q: 400, xbus.DELTA_V: 400}.items() <= emulator.outputs.items()
-        with pytest.raises(HilError, match=r"asked for 2500 Hz, the board grants 65535"):
+        with pytest.raises(HilError, match=r"asked for 2500 Hz, the board grants none: take another rate"):
             Xbus().configure(Dialog(port, Xbus()), 2500.0, port.baud)
+        assert emulator.measuring, "what is refused leaves no board silent"
         emulator.measuring = False
         with pytest.raises(HilError, match="refuses Nonsense: error 04"):
             xbus._ask(Dialog(port, Xbus()), "Nonsense", 0x12)
