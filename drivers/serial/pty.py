@@ -12,6 +12,7 @@ from drivers.serial.chunks import chunk_bytes, fill_chunks, is_chunk
 from nav.errors import HilError
 
 _CHUNK = 2048
+_TERMINALS = Path("/dev/pts")
 
 
 class PtyLink:
@@ -22,12 +23,12 @@ class PtyLink:
     Parameters
     ----------
     path : Path, optional
-        A link to the terminal is made there; what is in its place must be such a link.
+        A link to the terminal is made there; such a link whose terminal is gone is replaced.
 
     Raises
     ------
     HilError
-        There is something else at `path`, or its folder cannot be written.
+        There is anything else at `path`, or its folder cannot be written.
     """
 
     datagrams = False
@@ -37,19 +38,26 @@ class PtyLink:
         self._ours, self._theirs = os.openpty()
         tty.setraw(self._theirs)
         os.set_blocking(self._ours, False)
-        device = os.ttyname(self._theirs)
+        self._device = Path(os.ttyname(self._theirs))
         self._path = path
-        self.url = device if path is None else str(path)
+        self.url = str(path or self._device)
         if path is None:
             return
+        there = None
         try:
-            if path.is_symlink():
+            there = path.readlink() if path.is_symlink() else None
+            if there is not None and self._is_left(there):
                 path.unlink()
-            path.symlink_to(device)
+            path.symlink_to(self._device)
         except OSError as error:
             self._path = None
             self.close()
-            raise HilError(f"pty:{path}: {error.strerror}; give a path where nothing is") from error
+            link = f" (a link to {there}: remove it if no program needs it)" if there else ""
+            raise HilError(f"pty:{path}: {error.strerror}{link}; give a path where nothing is") from error
+
+    def _is_left(self, terminal: Path) -> bool:
+        """Whether a link to `terminal` was left behind: that is gone, or its number is ours now."""
+        return terminal == self._device or (terminal.parent == _TERMINALS and not terminal.exists())
 
     def fileno(self) -> int:
         """Descriptor to wait on for reading; constant."""
@@ -81,10 +89,10 @@ class PtyLink:
 
     def close(self) -> None:
         """Give everything back."""
+        if self._path is not None and self._path.is_symlink() and self._path.readlink() == self._device:
+            self._path.unlink()  # while the number is ours: another terminal may get it
         for fd in (self._ours, self._theirs):
             os.close(fd)
-        if self._path is not None and self._path.is_symlink():
-            self._path.unlink()
 
 
 class PtyPort:
