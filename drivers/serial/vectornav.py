@@ -39,6 +39,7 @@ TIME_STARTUP, DELTA_THETA_VEL = (COMMON, 0), (COMMON, 11)
 TEMPERATURE, SATURATION = (IMU, 4), (IMU, 11)
 _RATES = (((IMU, 3), (IMU, 2)), ((COMMON, 9), (COMMON, 9)), ((IMU, 10), (IMU, 9)), ((COMMON, 5), (COMMON, 8)))
 """Pairs of fields with angular rate and acceleration, the uncompensated ones first; common 9 holds both, acceleration first."""
+_INERTIAL = {DELTA_THETA_VEL, (IMU, 6), (IMU, 7)}.union(*_RATES)
 _SATURATED = 0x01F8
 """Bits of SensSat: an accelerometer or a gyro."""
 _LINE = re.compile(rb"\$VN[ -)+-~]{1,250}\*(?:[0-9A-Fa-f]{2}){1,2}\r\n")
@@ -55,6 +56,8 @@ class Layout:
     """Where the fields lie in packets of one header; -1 for what is not there."""
 
     length: int
+    inertial: bool
+    """A rate, force or increment is there, with its partner or without."""
     time: int
     step: int
     turn: int
@@ -90,7 +93,9 @@ def layout(header: bytes) -> Layout | None:
             if rate in places and force in places:
                 turn, push = places[rate] + 12 * (rate == force), places[force]
                 break
-    return Layout(at + 2, time, step, turn, push, step >= 0, places.get(TEMPERATURE, -1), places.get(SATURATION, -1))
+    inertial = not _INERTIAL.isdisjoint(places)
+    warm, full = places.get(TEMPERATURE, -1), places.get(SATURATION, -1)
+    return Layout(at + 2, inertial, time, step, turn, push, step >= 0, warm, full)
 
 
 def packet_of(groups: int, masks: Iterable[int], data: bytes) -> bytes:
@@ -147,8 +152,8 @@ class VectorNav:
             self._lines += 1
             return "foreign"
         where = layout(packet[1 : 2 + 2 * packet[1].bit_count()])
-        if where is None or (where.turn < 0 and where.time < 0):
-            return "foreign"
+        if where is None or not where.inertial:
+            return "foreign"  # a packet of slower outputs
         if where.turn < 0 or where.time < 0:
             return "short"
         if where.temperature >= 0 and math.isfinite(warm := struct.unpack_from("<f", packet, where.temperature)[0]):

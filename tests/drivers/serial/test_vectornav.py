@@ -78,6 +78,24 @@ def test_a_packet_without_time_is_short() -> None:
     assert driver.counters.short == 1
 
 
+def test_slow_outputs_are_foreign_with_a_time_or_without() -> None:
+    attitude = struct.pack("<3f", 10.0, 2.0, -1.0)
+    assert VectorNav().read(packet_of(0x01, (0x0008,), attitude)) == "foreign"
+    assert VectorNav().read(packet_of(0x01, (0x0009,), struct.pack("<Q", 5) + attitude)) == "foreign"
+    assert VectorNav().read(packet_of(0x06, (0x0001, 0x0010), struct.pack("<Qf", 5, 25.0))) == "foreign"
+
+
+@pytest.mark.parametrize(
+    ("group", "bit"), [(0x01, 5), (0x01, 8), (0x04, 2), (0x04, 3), (0x04, 7), (0x04, 9), (0x04, 10)]
+)
+@pytest.mark.parametrize("timed", [True, False])
+def test_half_of_a_pair_is_short(group: int, bit: int, timed: bool) -> None:
+    """A rate without a force, or the other way round, is what the board should send, and not enough."""
+    time = struct.pack("<Q", 5) * timed
+    groups, masks = (0x01, (int(timed) | 1 << bit,)) if group == 0x01 else (0x01 | group, (int(timed), 1 << bit))
+    assert VectorNav().read(packet_of(groups, masks, time + struct.pack("<3f", 0.1, 0.2, 0.3))) == "short"
+
+
 def test_a_step_that_is_no_time_is_short() -> None:
     driver = vectornav()
     for step in (0.0, -1.0, math.nan, math.inf):
