@@ -23,7 +23,8 @@ def inline_kernel(function: F) -> F:
 
 def _compiled(function: F, **options: bool) -> F:
     compiled: Any = numba.njit(nogil=True, error_model="numpy", **options)(function)
-    compiled._cache = KernelCache(function)  # as its `enable_caching` does with numba's own
+    if not numba.config.DISABLE_JIT:
+        compiled._cache = KernelCache(function, compiled.targetoptions)  # as its `enable_caching` does with numba's own
     kept: F = compiled
     return kept
 

@@ -1,75 +1,92 @@
-"""Compiled kernels on disk: numba's cache, but safe among processes, and aware of what a kernel is made of.
+"""Compiled kernels on disk: a file for each kernel and signature, with what it was made of.
 
-By itself numba gives one file name to two signatures when two processes compile them at the same time. From then on every process
-runs, for one of them, machine code that was made for the other one's arguments. And it asks only whether the file of a kernel has
-changed: a kernel of another file that is compiled into it, or a constant from there, stays the old one.
+numba's own cache has an index for each kernel. Two processes that compile at the same time may there give one file to two
+signatures, and one whose disk is full leaves the name of a new kernel on the code of an old one: every process then runs code
+that was made for something else. And it asks only whether the file of a kernel has changed: a kernel of another file that is
+compiled into it, or a constant from there, stays the old one. Here a file is whole or not used, and a kernel that cannot be
+kept is compiled again by the next process.
 """
 
-import fcntl
 import hashlib
 import os
+import pickle
+import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from enum import Enum, EnumType
 from functools import cache
 from types import CodeType, ModuleType
 from typing import Any
 
+import numba
 import numpy as np
+from numba.core import types
 from numba.core.caching import FunctionCache
+from numba.core.serialize import dumps
 
-_LOCK = "kernels.lock"
-_PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic, np.dtype)
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic, np.dtype, types.Type)
+_VERSIONED = {"numba", "numpy", "math", "builtins"}
+"""What is compiled in from here changes with numba's version."""
+_DIGEST = 32
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """What numba's dispatchers take for their cache."""
+    """What the dispatcher of `function`, compiled with `options`, takes for its cache."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+        super().__init__(function)
+        self._made_by = (numba.__version__, self._impl.locator.get_source_stamp(), sorted(options.items()))
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled kernel for a signature; None when there is none."""
-        with self._locked(fcntl.LOCK_SH):
-            return super().load_overload(sig, target_context)
+        target_context.refresh()
+        try:
+            with open(self._path(sig), "rb") as file:
+                key, check, kept = file.read(_DIGEST), file.read(_DIGEST), file.read()
+        except OSError:
+            return None
+        if key != self._key(sig, target_context.codegen()) or check != _digest(kept):
+            return None
+        return self._impl.rebuild(target_context, pickle.loads(kept))
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled kernel."""
-        with self._locked(fcntl.LOCK_EX):
-            super().save_overload(sig, data)
-
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(sig, codegen), *_fields(sig), digest(self._py_func))
-
-    @contextmanager
-    def _locked(self, how: int) -> Iterator[None]:
-        """No other process writes into the folder, or with LOCK_EX reads from it."""
-        descriptor = -1
-        with suppress(OSError):  # no leave, or a file system without locks: as numba does it
-            os.makedirs(self.cache_path, exist_ok=True)
-            descriptor = os.open(os.path.join(self.cache_path, _LOCK), os.O_RDONLY | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            fcntl.flock(descriptor, how)
+        """Keep a compiled kernel where there is room."""
+        if not self._impl.check_cachable(data):
+            return
+        kept = dumps(self._impl.reduce(data))
+        path = self._path(sig)
+        own = f"{path}.{os.getpid()}"
         try:
-            yield
-        finally:
-            if descriptor >= 0:
-                with suppress(OSError):
-                    fcntl.flock(descriptor, fcntl.LOCK_UN)  # a child that was forked meanwhile would hold it
-                os.close(descriptor)
+            self._impl.locator.ensure_cache_path()
+            with open(own, "wb") as file:
+                file.write(self._key(sig, data.codegen) + _digest(kept) + kept)
+            os.replace(own, path)
+        except OSError:
+            with suppress(OSError):
+                os.unlink(own)
+
+    def _path(self, sig: Any) -> str:
+        return os.path.join(self.cache_path, f"{self._impl.filename_base}.{_digest(_signature(sig)).hex()[:16]}.nbk")
+
+    def _key(self, sig: Any, codegen: Any) -> bytes:
+        return _digest(repr((_signature(sig), codegen.magic_tuple(), self._made_by, made_of(self._py_func))).encode())
 
 
 @cache
-def digest(function: Callable[..., Any]) -> str:
+def made_of(function: Callable[..., Any]) -> str:
     """Digest of a kernel, the kernels that it calls and the constants that are compiled into it, the same in every process."""
-    found = hashlib.sha256()
-    for part in _parts(function, set()):
-        found.update(part.encode())
-        found.update(b"\0")
-    return found.hexdigest()
+    return _digest("\0".join(_parts(function, set())).encode()).hex()
 
 
-def _fields(types: Any) -> Iterator[tuple[str, ...]]:
-    """Names of the fields of the named tuples among numba's types; to numba the class is all that counts."""
-    for kind in types:
-        yield getattr(kind, "fields", ())
-        yield from _fields(getattr(kind, "types", ()))
+def _digest(data: bytes) -> bytes:
+    return hashlib.sha256(data).digest()
+
+
+def _signature(kinds: Any) -> bytes:
+    """The types of arguments; a named tuple's name alone does not say what its fields are called."""
+    return repr(
+        [(kind, getattr(kind, "fields", ()), _signature(getattr(kind, "types", ()))) for kind in kinds]
+    ).encode()
 
 
 def _parts(function: Callable[..., Any], seen: set[Any]) -> Iterator[str]:
@@ -79,7 +96,7 @@ def _parts(function: Callable[..., Any], seen: set[Any]) -> Iterator[str]:
     names: list[str] = []
     yield from _code(function.__code__, names)
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    for value in [*cells, *_named(function.__globals__, names)]:
+    for value in [function.__defaults__, *cells, *_named(function.__globals__, names)]:
         yield from _value(value, seen)
 
 
@@ -117,6 +134,20 @@ def _value(value: Any, seen: set[Any]) -> Iterator[str]:
         members: Mapping[str, Enum] = value.__members__
         yield repr([(name, member.value) for name, member in members.items()])
     elif hasattr(value, "py_func"):
+        yield repr(sorted(value.targetoptions.items()))
         yield from _parts(value.py_func, seen)
     else:
-        yield f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value).__qualname__)}"
+        module = str(getattr(value, "__module__", ""))
+        yield f"{module}.{getattr(value, '__qualname__', type(value).__qualname__)}"
+        yield _file(module)
+
+
+@cache
+def _file(module: str) -> str:
+    """Digest of the source of what numba asks to be compiled in (intrinsics, overloads)."""
+    path = getattr(sys.modules.get(module), "__file__", None)
+    if path is None or module.partition(".")[0] in _VERSIONED:
+        return ""
+    with suppress(OSError), open(path, "rb") as file:
+        return _digest(file.read()).hex()
+    return ""
