@@ -13,7 +13,6 @@ import gc
 import hashlib
 import math
 import os
-import signal
 import time
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -486,7 +485,6 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
 
     Sends through `answer` a dict: the result, or ``{"failed": message}``.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     stats = outlets.stats
     try:
         warm_loop(order.scenario, lambda done: stats.__setitem__("warm_loop", done))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from hil import cli_files, cli_version, cli_watch
-from hil.cli_common import Json, RunFailed, StopSignal, report, say
+from hil.cli_common import Json, RunFailed, StopSignal, check_outputs, report, say
 from nav.errors import HilError
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def run(
     from hil.bridge import LoopOrder
     from hil.cli_wires import look_before
     from hil.scenario import load
-    from hil.session import simulated_head
+    from hil.session import private_bus, simulated_head
 
     chosen = load(scenario).with_changes(
         **_changes(bus=bus, driver=imu, duration_s=duration, seed=seed, mavlink=mavlink, feed=feed)
@@ -113,7 +113,7 @@ def run(
     for warning in look_before(chosen):
         say(warning)
     order = LoopOrder(
-        chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else f"unix:run-{os.getpid()}")),
+        chosen.with_changes(bus=chosen.bus or (COMMON_BUS if outside else private_bus())),
         paced=_paced(speed),
         own_world=not outside,
         realtime=realtime,
@@ -184,6 +184,7 @@ def replay(
 
     from hil.player import plan_replay, run_player
 
+    check_outputs((log,), (record, mcap, tlog, plot, smooth, junit))
     order, over_bus = plan_replay(log, scenario, bus, paced=_paced(speed))
     changed = order.scenario.with_changes(**_changes(mavlink=mavlink, feed=feed or [], withhold=withhold))
     order = replace(order, scenario=_links(changed, mavlink_key, tlog), realtime=realtime)
@@ -458,6 +459,8 @@ def _outage(text: str) -> dict[str, Any]:
 def main() -> None:
     """Entry point."""
     try:
+        if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
+            raise HilError("NUMBA_DISABLE_JIT is set, and there is nothing but compiled kernels: unset it")
         app()
     except HilError as error:
         for line in str(error).splitlines():

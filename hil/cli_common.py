@@ -3,6 +3,9 @@
 import json
 import signal
 import sys
+from collections.abc import Iterable
+from itertools import product
+from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
 
@@ -18,12 +21,15 @@ class RunFailed(HilError):
 
 
 class StopSignal:
-    """Ctrl-C or SIGTERM asks for a clean stop; a second one ends at once."""
+    """Ctrl-C, SIGTERM or a terminal that closes asks for a clean stop; a second one ends at once."""
 
     def __init__(self) -> None:
         self.wanted = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._take)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if (
+                number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN
+            ):  # which is how nohup lets it go on
+                signal.signal(number, self._take)
 
     def call(self) -> None:
         """Ask for it."""
@@ -47,3 +53,10 @@ def report(result: dict[str, Any], *, as_json: bool) -> None:
         return
     for key, value in result.items():
         print(f"{key}: {value}")
+
+
+def check_outputs(sources: Iterable[Path | None], outputs: Iterable[Path | None]) -> None:
+    """Refuse (`HilError`) to write over what is read."""
+    for source, out in product(filter(None, sources), filter(None, outputs)):
+        if source.exists() and out.exists() and source.samefile(out):
+            raise HilError(f"{out} is what is read: give another file to write")

@@ -6,8 +6,10 @@ the loop, the count of recorded frames from the recorder. The readers of the rin
 
 import multiprocessing as mp
 import os
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from multiprocessing.connection import wait
 from threading import Thread
@@ -26,6 +28,9 @@ FEEDS = 16
 """Most feeds of a run."""
 READERS = {"publisher": _PUBLISHER, "recorder": _RECORDER, **{f"feed {k}": _FIELDS + k for k in range(FEEDS)}}
 """Processes that say with a beat that they are at work."""
+
+ENDINGS = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+"""Signals that a terminal, `timeout` or a service manager may send to all processes of a run; the session ends them."""
 
 ORPHAN_S = 10.0
 """Longest time for a process to end on its own when the one that started it is gone."""
@@ -167,6 +172,10 @@ class Control:
     def recorded(self, count: int) -> None:
         self._values[_RECORDED] = count
 
+    def recorder_is_gone(self) -> None:
+        """Nobody need wait for the recorder to take over frames."""
+        self._values[_RECORDED] = 1 << 62
+
 
 def run_part(control: Control, nice: int, aside: bool, target: Callable[..., None], *args: Any) -> None:
     """Target of every process of a run: calls ``target(*args)``, and has it stopped when the session is gone.
@@ -176,6 +185,7 @@ def run_part(control: Control, nice: int, aside: bool, target: Callable[..., Non
 
     A session that is killed cannot order anything: without this a simulated head would go on sending for ever.
     """
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
     os.nice(nice)
     if aside:
         step_aside()
@@ -187,6 +197,16 @@ def run_part(control: Control, nice: int, aside: bool, target: Callable[..., Non
     except BrokenPipeError:
         if parent is None or parent.is_alive():
             raise
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """What is started herein takes none of `ENDINGS`."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _outlive(control: Control, sentinel: int) -> None:

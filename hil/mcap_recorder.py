@@ -1,6 +1,5 @@
 """MCAP files: the process that writes one beside a run, and the export of a recording."""
 
-import signal
 import time
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -46,8 +45,6 @@ class _Taker:
 
 def run_mcap(path: Path, outlets: Outlets, answer: Connection) -> None:
     """Write until the loop is done and the rings are empty; answers ``{"file", "messages", "lost"}`` or ``{"failed"}``."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the loop's end is ours, and the file is finished then
     try:
         with McapLog(path) as log:
             taker = _Taker(log, outlets)

@@ -7,7 +7,6 @@ goes out has just been computed. The loop that computes never waits for it.
 import math
 import os
 import selectors
-import signal
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -111,7 +110,6 @@ def run_publisher(config: MavlinkConfig, taps: Taps, stop: Wake, report: Connect
         ``aiding`` (``taken`` by message, ``refused`` by reason); or ``failed``, a text, when a link could not be
         opened or the configuration is wrong.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
         try:
             identity = Identity(config.system_id, config.component_id, config.vehicle)

@@ -165,12 +165,16 @@ def hil_bridge() -> Iterator[StartBridge]:
             realtime: bool = False,
             **changes: Any,
         ) -> Bridge:
+            from drivers.can.unix_bus import remove
             from hil.bridge import LoopOrder
             from hil.scenario import Scenario, load
             from hil.session import Session, simulated_head
 
             chosen = scenario if isinstance(scenario, Scenario) else load(scenario)
-            changes.setdefault("bus", f"unix:test-{time.monotonic_ns():x}")
+            if "bus" not in changes:
+                name = f"test-{time.monotonic_ns():x}"
+                changes["bus"] = f"unix:{name}"
+                stack.callback(remove, name)
             port = None
             if "links" not in changes.get("mavlink", {}):
                 port = _free_udp_port()

@@ -7,7 +7,6 @@ the loop's fit leads (:mod:`hil.clock`): both steps take the fastest transport s
 
 import contextlib
 import math
-import signal
 import time
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -162,7 +161,6 @@ def run_receiver(
     Sends through `report` dictionaries: ``ready`` when it listens, and at the end what was counted; or ``{"failed": message}``
     where the port cannot be opened.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         relay = Relay(config, number, stats, ring)
         relay.warm_up()

@@ -1,7 +1,6 @@
 """The recorder's process: takes frames from the loop's ring into a recording, and is never waited for in real time."""
 
 import select
-import signal
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
     Answers ``{"file", "frames", "lost"}`` or ``{"failed"}``; ``{"problem": (severity, text)}`` goes out at once when the disk
     takes no more, and when it does again.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     ring, control, stats = outlets.frames, outlets.control, outlets.stats
     wake = ring.wakes[0]
     batch = frames(4096)
@@ -49,7 +47,7 @@ def run_recorder(path: Path, header: dict[str, Any], outlets: Outlets, answer: C
             writer.flush()
         answer.send({"file": str(path), "frames": writer.written, "lost": lost + writer.lost})
     except (HilError, OSError) as error:
-        control.recorded = 1 << 62  # the loop must not wait for us
+        control.recorder_is_gone()
         answer.send({"failed": f"recorder: {error}"})
     finally:
         answer.close()

@@ -12,6 +12,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -20,10 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from drivers.can.unix_bus import remove
 from drivers.utc import PulseClock
 from hil.bridge import EVENTS, LoopOrder, Outlets, run_loop
 from hil.clock import clock_summary
-from hil.control import READERS, run_part
+from hil.control import READERS, run_part, undisturbed
 from hil.dashboard import Sources, Window, recording_name, run_dashboard
 from hil.feed.group import FeedGroup
 from hil.link_stats import LinkStats
@@ -46,6 +48,8 @@ RECORDER_STOP_S = 60.0
 """The recorder gets longer: what is in the ring is not to be lost."""
 STOP_S = 10.0
 """Longest time for a process to end on its own."""
+HURRY_S = 1.0
+"""The same before the run has begun: one that still compiles has nothing to lose."""
 STOPPED_S = 3.0
 """A reader without a beat for so long has stopped."""
 BUSY_NS = 500_000_000
@@ -172,6 +176,9 @@ class Session:
         scenario, outlets, launch = self.order.scenario, self.outlets, self._launch
         preload = ["hil.bridge", "hil.publisher", "hil.recorder", "hil.world.head"]
         mp.get_context("forkserver").set_forkserver_preload([*preload, "hil.receiver"] if self._receivers else preload)
+        resource_tracker.ensure_running()
+        with undisturbed():  # it tells how the others end
+            forkserver.ensure_running()
         if self._record is not None:
             self._launch_recorder(self._record)
         if self._mcap is not None:
@@ -238,7 +245,7 @@ class Session:
         self._watch()
         self._pulses.poll()
         if not self.ready:
-            return True
+            return not self.outlets.control.stop
         feeder = self._parts.get("feeder")
         if feeder is not None and not feeder.process.is_alive():
             frames = self.outlets.stats["frames"]
@@ -338,6 +345,8 @@ class Session:
                 continue
             if part.name in {"loop", "feeder"} or not self.outlets.control.go:
                 raise HilError(str(failed))
+            if part.name == "recorder":
+                self.outlets.control.recorder_is_gone()
             if failed not in self.problems:
                 self._note(str(failed), "error", problem=True)
                 if part.name in self.feeds.names:
@@ -382,10 +391,18 @@ class Session:
         self._tell_stations(severity, text)
 
     def _end(self) -> None:
+        try:
+            self._stop_parts()
+        except BaseException:  # a second Ctrl-C
+            for part in self._parts.values():
+                part.process.kill()
+            raise
+
+    def _stop_parts(self) -> None:
         self._ended = time.monotonic()
         control, stats = self.outlets.control, self.outlets.stats
         control.order_stop()
-        deadline = time.monotonic() + STOP_S
+        deadline = time.monotonic() + (STOP_S if control.go else HURRY_S)
         for name in (
             "loop",
             "feeder",
@@ -410,10 +427,13 @@ class Session:
             if part.process.is_alive():
                 part.process.kill()
                 part.process.join()
-                self.problems.append(f"the {name} process did not end and was killed")
+                if control.go:
+                    self.problems.append(f"the {name} process did not end and was killed")
             if name == "loop" and stats["phase"] not in (Phase.DONE, Phase.FAILED):
                 stats["phase"] = Phase.FAILED  # it died: the recorder must know
             self._read(part)
+        if self.order.scenario.bus == private_bus():
+            remove(private_bus().removeprefix("unix:"))
 
     def _answers(self, name: str) -> _Answers:
         part = self._parts[name]
@@ -458,6 +478,11 @@ class Session:
         if self.problems or told:
             result["problems"] = self.problems + told
         return result
+
+
+def private_bus() -> str:
+    """The bus of this process's run and of nobody else."""
+    return f"unix:run-{os.getpid()}"
 
 
 def simulated_head(order: LoopOrder) -> tuple[Callable[..., None], Sequence[Any]]:

@@ -10,7 +10,7 @@ from hil import cli
 
 def called(*arguments: object) -> tuple[int, str, str]:
     """``hil ARGUMENT...``: exit code, standard output, standard error."""
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     out, err, ended = io.StringIO(), io.StringIO(), 0
     with (
         contextlib.redirect_stdout(out),

@@ -12,6 +12,7 @@ import fcntl
 import os
 import re
 import select
+import shutil
 import socket
 import tempfile
 import time
@@ -173,7 +174,9 @@ class UnixPort:
                     peer = self._peers.get(fd)
                     if peer is not None and _has_gone(peer):
                         self._remove(fd)
-        return filled // FRAME.itemsize
+        n = filled // FRAME.itemsize
+        batch["reserved"][:n] = 0  # what marks an event in a recording is nothing that a bus can say
+        return n
 
     def send(self, batch: FrameArray) -> None:
         """Send `batch` to every listener, stamped with the host's clock; when lossless, a stamp that a frame has is kept."""
@@ -283,9 +286,17 @@ def _alive(peer: socket.socket) -> bool:
     return not poll.poll(0)
 
 
+def remove(name: str) -> None:
+    """Leave nothing of a bus that nobody will join any more."""
+    shutil.rmtree(_root() / name, ignore_errors=True)
+
+
+def _root() -> Path:
+    return Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"dtg-hil-{os.getuid()}"
+
+
 def _folder(name: str) -> Path:
-    base = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
-    root = Path(base) / f"dtg-hil-{os.getuid()}"
+    root = _root()
     folder = root / name
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     if root.stat().st_uid != os.getuid():

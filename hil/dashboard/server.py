@@ -10,7 +10,6 @@ import contextlib
 import ipaddress
 import json
 import secrets
-import signal
 from collections.abc import AsyncIterator, Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -51,7 +50,6 @@ def run_dashboard(window: Window, sources: Sources, answer: Connection) -> None:
         def capture_signals(self) -> Iterator[None]:
             yield
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     view = View(sources)
     hub = _Hub(view)
 

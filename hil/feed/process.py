@@ -2,7 +2,6 @@
 
 import contextlib
 import selectors
-import signal
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -35,7 +34,6 @@ def run_feed(config: FeedConfig, scenario: Scenario, joint: Socket, stop: Wake, 
 
     `report` gets ``{"place": text}`` when the autopilot may come and the counters at the end, or ``{"failed": text}``.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides when to end
     with ExitStack() as stack:
         try:
             _warm_up(config, scenario)

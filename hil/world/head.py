@@ -7,7 +7,6 @@ board rounds them.
 """
 
 import math
-import signal
 import time
 from collections.abc import Callable, Iterator
 from itertools import chain
@@ -197,7 +196,6 @@ def run_head(scenario: Scenario, paced: bool, control: Control, stats: Stats, an
 
     Answers ``{"sent": samples, "dropped": frames}``, with ``"wire"`` where it is faulty, or ``{"failed": message}``.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         warm_head(scenario, lambda done: stats.__setitem__("warm_head", done))
         head = SimulatedHead(scenario)
