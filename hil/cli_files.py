@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hil.cli_common import Json, RunFailed, report, say
+from hil.cli_common import Json, RunFailed, check_outputs, report, say
 from nav.errors import HilError
 
 
@@ -33,6 +33,7 @@ def navigate(
     core = Strapdown(attitude, mechanization, gravity)  # refuses unknown names before the file is read
     if smooth and aid is None:
         raise HilError("--smooth needs measurements: give --aid FILE")
+    check_outputs((imu_file, init, aid), (out,))
     table, (start, config) = read_table(imu_file, IMU_HEADER), read_init(init)
     header: tuple[str, ...] = NAV_HEADER
     extra: dict[str, Any] = {}
@@ -83,6 +84,7 @@ def export(
     """Write the samples of a recording as a table, a column a signal; or its navigation for Foxglove (.mcap)."""
     import numpy as np
 
+    check_outputs((file,), (out,))
     if out.suffix == ".mcap":
         from hil.mcap_recorder import export_mcap
 

@@ -1,7 +1,6 @@
 """Playing a recording onto a bus: foreign IMU logs become frames of a head, frame recordings go out as they are."""
 
 import math
-import signal
 import time
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
@@ -21,7 +20,7 @@ from hil.flight_log import is_flight_log, read_flight_log
 from hil.pacing import Pacer
 from hil.reference import Reference, interpolate_attitude
 from hil.scenario import Scenario, load, validated
-from hil.source import FileSource, is_own, scenario_table
+from hil.source import PAUSE_NS, FileSource, is_own, scenario_table
 from hil.stats import Stats
 from nav.aiding import Kind
 from nav.alignment.analytic import magnetic_heading
@@ -139,7 +138,6 @@ def _magnetic_start(log: ImuLog) -> float | None:
 
 def run_player(path: Path, scenario: Scenario, paced: bool, control: Control, _: Stats, answer: Connection) -> None:
     """Target of the player's process; begins on `Control.go`, answers ``{"sent", "dropped"}`` or ``{"failed"}``."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         port = open_port(scenario.bus, listen=False, lossless=not paced)
         while not (control.go or control.stop):
@@ -168,14 +166,17 @@ def timed(path: Path, *, one_by_one: bool) -> Iterator[tuple[float, FrameArray]]
         return
     source = FileSource(path, paced=False)
     batch = frames(CHUNK)
-    start: int | None = None
+    due_ns, last_ns = 0, None
     while n := source.receive(batch, 0.0):
         good = batch[:n][batch["reserved"][:n, 0] == 0]
         pieces = np.split(good, range(1, len(good))) if one_by_one else [good]
         for piece in pieces:
             if len(piece):
-                start = int(piece["time_ns"][0]) if start is None else start
-                yield (int(piece["time_ns"][0]) - start) * 1e-9, piece.copy()
+                time_ns = int(piece["time_ns"][0])
+                pause_ns = 0 if last_ns is None else time_ns - last_ns
+                due_ns += pause_ns if abs(pause_ns) <= PAUSE_NS else 0
+                last_ns = time_ns
+                yield due_ns * 1e-9, piece.copy()
 
 
 def _head_frames(log: ImuLog, chunk: int) -> Iterator[tuple[float, FrameArray]]:

@@ -18,6 +18,9 @@ from nav.errors import HilError
 _READERS: dict[str, Any] = {".log": can.CanutilsLogReader, ".blf": BlfReader, ".asc": can.ASCReader}
 """By file ending; python-can finds the others itself, among its plug-ins."""
 
+PAUSE_NS = 10_000_000_000
+"""No pause in a recording is kept up for longer: the host's clock may have been set by an hour, or by years at its start."""
+
 
 class Source(Protocol):
     """Frames for the loop."""
@@ -185,6 +188,8 @@ class FileSource:
         if self._shift_ns is None:
             self._shift_ns = now - int(times[0])
         wait = int(times[0]) + self._shift_ns - now
+        if abs(wait) > PAUSE_NS:
+            self._shift_ns, wait = now - int(times[0]), 0
         if wait > 0:
             time.sleep(min(wait * 1e-9, timeout))
             now = time.monotonic_ns()

@@ -123,8 +123,8 @@ class Wire:
         """What has become of the lost samples of the chunk that goes out."""
         self._held: _Traffic | None = None
         self._last_due, self._swapped = 0.0, -2
-        self.samples = 0
-        """Samples whose time has come."""
+        self.samples = self._end = 0
+        """Samples whose time has come, and at the end of the chunk."""
 
     def take(self, first: int, slow: FrameArray, batch: FrameArray) -> Iterator[tuple[float, FrameArray]]:
         """What goes out of a chunk of `SimulatedHead.chunks`: (when it is due, s; frames), in order.
@@ -134,6 +134,7 @@ class Wire:
         traffic = self._traffic(first, slow, batch)
         end = int(traffic.sample[-1]) + 1
         self._lost_by.update(self._fates.values())
+        self.samples, self._end = max(self.samples, first), end
         frozen = np.unique(traffic.sample[traffic.frozen & (traffic.kind == _SAMPLE)]).tolist()
         self._fates = dict.fromkeys(frozen, "counter-freeze")
         self._injected["counter-freeze"] += len(frozen)
@@ -155,6 +156,7 @@ class Wire:
         held, self._held = self._held, None
         if held is not None:
             yield from self._out(held)
+        self.samples = self._end
 
     def is_plugged(self, time_s: float) -> bool:
         """Whether the port is there."""

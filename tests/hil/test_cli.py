@@ -6,10 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import version as installed
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,9 @@ from commands import called
 from drivers.can.convert import to_message
 from drivers.can.dtg_head_emulator import HeadEncoder
 from drivers.can.frames import FrameArray
+from drivers.logs.recording import RecordingWriter
 from drivers.mavlink.commands import autopilot_version
+from hil.control import ENDINGS
 
 Cli = Callable[..., tuple[int, str, str]]
 HIL = (sys.executable, "-c", "from hil.cli import main; main()")
@@ -350,20 +354,67 @@ def test_the_version_is_that_of_the_package_and_of_autopilot_version(hil: Cli, a
     assert [int(number, 16) >> shift & 255 for shift in (24, 16, 8)] == [int(part) for part in version.split(".")[:3]]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
-def test_stop_signal_ends_with_the_summary(number: int) -> None:
+@pytest.fixture
+def room() -> Iterator[Path]:
+    """A folder with a path short enough for sockets."""
+    with TemporaryDirectory() as folder:
+        yield Path(folder)
+
+
+def slow(value: Any) -> Any:
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, *(slow(one) for one in sorted(ENDINGS - {signal.SIGINT}))])
+def test_stop_signal_ends_with_the_summary(number: int, room: Path) -> None:
+    """Sent to all processes of the run, as a terminal, `timeout` and service managers do."""
     command = [*HIL, "run", "--mavlink", "none", "--json"]
+    own = {**os.environ, "NO_COLOR": "1", "XDG_RUNTIME_DIR": str(room)}
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env={**os.environ, "NO_COLOR": "1"}
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=own, start_new_session=True
     ) as process:
         assert process.stderr
         for line in process.stderr:
             if "aligning" in line:
                 break
-        process.send_signal(number)
+        os.killpg(process.pid, number)
         out, err = process.communicate(timeout=30)
     assert process.returncode == 0, err
-    assert json.loads(out)["samples"] > 0
+    summary = json.loads(out)
+    assert summary["samples"] > 0
+    assert "problems" not in summary
+    assert list(room.glob("*/*")) == [], "nothing is left of the private bus"
+
+
+@pytest.mark.slow
+def test_a_run_is_stopped_while_it_compiles(tmp_path: Path) -> None:
+    own = {**os.environ, "NO_COLOR": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [*HIL, "run", "--mavlink", "none", "--no-dashboard", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=own) as process:
+        assert process.stderr
+        for line in process.stderr:
+            if "preparing" in line:
+                break
+        time.sleep(3.0)
+        process.send_signal(signal.SIGTERM)
+        stopped = time.monotonic()
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert json.loads(out)["samples"] == 0
+    assert time.monotonic() - stopped < 30.0  # to compile all takes a minute
+
+
+def test_what_is_read_is_not_written_over(hil: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "a.dhil"
+    with RecordingWriter(path, {}):
+        pass
+    (tmp_path / "b.dhil").symlink_to(path)
+    before = path.read_bytes()
+    for option in ("--record", "--mcap", "--smooth"):
+        code, out, err = hil("replay", path, option, tmp_path / "b.dhil", "--speed", "max")
+        assert (code, out) == (2, "")
+        assert f"{tmp_path / 'b.dhil'} is what is read: give another file to write" in err
+    assert path.read_bytes() == before
 
 
 def test_an_unknown_study_is_refused_before_the_first_runs(hil: Cli) -> None:

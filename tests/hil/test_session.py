@@ -130,6 +130,14 @@ def test_death_of_a_listener_is_said_and_the_run_goes_on(hil_bridge: StartBridge
     assert summary["lost"] == 0
 
 
+def test_simulated_time_waits_for_no_dead_recorder(hil_bridge: StartBridge, tmp_path: Path) -> None:
+    bridge = hil_bridge(navigation=TRUTH, duration_s=400, paced=False, record=tmp_path / "run.dhil")
+    kill(bridge.session, "recorder")
+    summary = bridge.wait_end(120)
+    assert summary["samples"] == 400_000
+    assert summary["problems"] == ["the recorder process died (exit code -9)"]
+
+
 def test_a_killed_run_leaves_a_usable_recording(hil_bridge: StartBridge, tmp_path: Path) -> None:
     bridge = hil_bridge(navigation=TRUTH, record=tmp_path / "run.dhil")
     bridge.wait_mode("navigate")

@@ -10,8 +10,9 @@ import pytest
 
 from drivers.can.convert import from_message, to_message
 from drivers.can.frames import BRS, EFF, FDF, frames
-from drivers.can.unix_bus import UnixPort
+from drivers.can.unix_bus import PACKET, UnixPort
 from drivers.logs.recording import RecordingWriter
+from hil.player import timed
 from hil.source import BusSource, FileSource, is_own
 from nav.errors import HilError
 
@@ -75,6 +76,18 @@ def test_paced_keeps_the_recorded_times(tmp_path):
     assert 0.299 <= (time.monotonic_ns() - start) * 1e-9 < 1.0
 
 
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_a_host_clock_that_was_set_holds_nothing_up(tmp_path, step_s):
+    batch = numbered(200)
+    batch["time_ns"][100:] += round(1e9 * step_s)
+    path = recorded(tmp_path / "a.hil", batch)
+    source, began = FileSource(path, paced=True), time.monotonic()
+    assert len(drained(source, 10)) == 200
+    assert 0.15 < time.monotonic() - began < 5.0
+    due = [due_s for due_s, _ in timed(path, one_by_one=True)]
+    assert due[-1] == pytest.approx(0.198)
+
+
 def test_damage_is_told_and_what_came_before_is_used(tmp_path):
     path = recorded(tmp_path / "a.hil", numbered(100))
     path.write_bytes(path.read_bytes()[:-1])
@@ -115,6 +128,19 @@ def test_a_bus_is_a_source(tmp_path_factory, monkeypatch, paced):
         assert source.problem() == ""
     with pytest.raises(HilError):
         BusSource("nowhere", paced=paced)
+
+
+def test_a_bus_tells_no_event(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    with closing(BusSource("unix:x", paced=True)) as source, closing(UnixPort("x", listen=False)) as port:
+        odd = numbered(3)
+        odd["reserved"] = 1
+        batch = frames(PACKET)
+        while not port.listeners:
+            pass
+        port.send(odd)
+        assert source.receive(batch, 1.0) == 3
+        assert not batch["reserved"][:3].any()
 
 
 @pytest.mark.parametrize("size", [0, 16, 31])

@@ -46,6 +46,13 @@ def counted(frames: FrameArray, driver: str = "dtg-head") -> dict[str, int]:
     return board.counters.as_dict()
 
 
+@pytest.mark.parametrize("kind", ["silence", "drop"])
+def test_samples_lost_at_the_end_are_in_the_balance(kind: str) -> None:
+    pieces, report = sent(scenario({"kind": kind, "at_s": 2.0}))
+    assert report["samples"] == SAMPLES
+    assert counted(joined(pieces))["samples"] + report["lost"][kind] == SAMPLES
+
+
 @pytest.mark.parametrize("layout", ["fd", "classic"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_fault_is_counted_exactly(kind: str, layout: str) -> None:
