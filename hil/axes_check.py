@@ -29,6 +29,8 @@ ASKEW_DEG = 12.0
 """What is further off stands askew: more than a hand errs by."""
 UNIT_SHARE = 0.15
 """A specific force at rest that is further from 1 g, as a share, is in another unit."""
+MUTE_S = 5.0
+"""A board that is there has sent something by then."""
 WAIT_S = 60.0
 """Longest time for one posture."""
 
@@ -167,9 +169,14 @@ def of_recording(path: Path, driver_name: str | None) -> Iterator[ImuIncrements]
     head = HeadConfig()
     if is_own(path) and (table := scenario_table(path)) is not None:
         head = validated(table, f"in recording {path}").head
-    board = BoardSamples(driver_name or driver_of(path), head)
+    name = driver_name or driver_of(path)
+    board, count = BoardSamples(name, head), 0
     for batch in FileSource(path, paced=False).batches(1024):
-        yield board.take(batch)
+        samples = board.take(batch)
+        count += len(samples)
+        yield samples
+    if not count:
+        raise HilError(f"{path}: no samples of {name} in it: give the board's driver with --imu")
 
 
 def of_bus(url: str, driver_name: str, scenario: str | None, cancelled: Callable[[], bool]) -> Iterator[ImuIncrements]:
@@ -191,11 +198,16 @@ def guide(
     Raises
     ------
     HilError
-        A posture did not come in time.
+        No samples come, or a posture did not in time.
     """
-    asked, since = -1, clock()
+    asked, since, came = -1, clock(), False
     for imu in samples:
         check.take(imu)
+        came = came or len(imu) > 0
+        if not came:
+            if clock() - since > MUTE_S:
+                raise HilError(f"no samples in {MUTE_S:g} s: hil monitor shows what comes, and who understands it")
+            continue
         done = len(check.postures.found)
         if done >= len(ORDERS):
             return

@@ -505,6 +505,11 @@ def run_loop(order: LoopOrder, outlets: Outlets, answer: Connection) -> None:
             _run(loop, source, order, outlets, alone=granted is not None and granted.processor >= 0)
         finally:
             source.close()
+        if source.exhausted and loop.samples == 0:
+            driver, count = order.scenario.driver, stats["frames"]
+            raise HilError(
+                f"{order.file}: no sample of {driver} in {count} frames: name its driver in a scenario, --scenario FILE"
+            )
         result = loop.result() | {"overflowed": source.overflowed}
         if granted:
             result["realtime"] = granted.as_dict()

@@ -225,6 +225,7 @@ app.command()(cli_files.calibrate)
 def record(
     file: Annotated[Path, typer.Argument(help=".dhil, or .log, .blf, .asc for other tools.")],
     bus: Annotated[str, typer.Option(help="Bus URL.")],
+    imu: Annotated[str | None, typer.Option(help="Driver of the board, for those who use the recording.")] = None,
     scenario: Annotated[str | None, typer.Option(help="Scenario that a replay of this recording shall use.")] = None,
     duration: Annotated[float | None, typer.Option(min=0.0, help="Seconds, then stop.")] = None,
     as_json: Json = False,
@@ -234,7 +235,7 @@ def record(
     from hil.scenario import load
 
     stop = StopSignal()
-    chosen = load(scenario).with_changes(bus=bus)
+    chosen = load(scenario).with_changes(**_changes(bus=bus, driver=imu))
     report(record_bus(chosen, file, duration, lambda: stop.wanted, say), as_json=as_json)
 
 

@@ -33,6 +33,10 @@ def check_axes(
     else:
         if imu is None:
             raise HilError("--imu is missing: the driver of the board (hil monitor finds it)")
+        from hil.watch import look_first
+
+        if hint := look_first(bus or "", imu):
+            say(hint)
         stop = StopSignal()
         try:
             guide(check, of_bus(bus or "", imu, scenario, lambda: stop.wanted), say, time.monotonic)

@@ -10,13 +10,12 @@ from typing import Any
 import can
 
 from drivers import make_driver
-from drivers.can.bus import open_port
 from drivers.can.convert import to_message
 from drivers.can.frames import frames
 from drivers.logs.recording import RecordingWriter
 from drivers.serial.chunks import is_chunk
 from hil.scenario import Scenario
-from hil.source import FileSource
+from hil.source import BusSource, FileSource
 from nav.errors import HilError
 
 _FIELDS = ("time", "step", "sequence", "validity", "dtheta", "dvel", "rotor")
@@ -54,30 +53,34 @@ def record_bus(
     cancelled: Callable[[], bool],
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Record frames of the scenario's bus until cancelled; what was recorded. `tell` hears at once when the disk is full."""
-    port = open_port(scenario.bus)
+    """Record frames of the scenario's bus until cancelled; what was recorded. `tell` hears at once when disk or bus fail."""
+    source = BusSource(scenario.bus, paced=True)
     batch = frames(1024)
-    count, chunks, problem, began = 0, 0, "", time.monotonic()
+    count, chunks, problem, trouble, began = 0, 0, "", "", time.monotonic()
     writer = _writer(path, scenario)
     try:
         with writer as write:
             while not cancelled() and (duration_s is None or time.monotonic() - began < duration_s):
-                n = port.receive(batch, 0.05)
+                n = source.receive(batch, 0.05)
                 write(batch[:n])
                 count += n
                 chunks += int(is_chunk(batch[:n]).sum())
                 if writer.problem() != problem:
                     problem = writer.problem()
                     tell(f"{problem}: frames are lost to it" if problem else f"recording {path}: there is room again")
+                if source.trouble != trouble:
+                    trouble = source.trouble
+                    tell(trouble or f"{scenario.bus} is back")
     finally:
-        port.close()
+        source.close()
     left_out = {"not_exported": chunks} if path.suffix != ".dhil" and chunks else {}
     return {
         "file": str(path),
         "frames": count - writer.lost(),
         "lost": writer.lost(),
-        "overflowed": getattr(port, "overflowed", 0),
+        "overflowed": source.overflowed,
         **left_out,
+        **({"problem": source.problem()} if source.problem() else {}),
         "seconds": time.monotonic() - began,
     }
 

@@ -168,6 +168,8 @@ def check_port(url: str, driver: str, patience_s: float = 1.0) -> str:
             f"{url}: no packet of {driver} in {patience_s:g} s ({heard.bytes} bytes came), "
             f"but {found.driver} at {found.baud} baud: use {options_of(found, place)}"
         )
+    if driver.partition("@")[0] not in (boards := serial_drivers()):
+        raise HilError(f"{url}: a {driver} is at no serial port: name the board that is, --imu {' | '.join(boards)}")
     if heard.bytes:
         return f"{url}: {heard.bytes} bytes in {patience_s:g} s, no packet of {driver}, and none of any board at the usual rates"
     return f"{url}: nothing comes; is the board powered, its sending line wired, and set to send? hil configure {driver} ..."

@@ -24,7 +24,7 @@ from drivers.logs.recording import RecordingWriter
 from hil.bridge import Loop, LoopOrder, Outlets
 from hil.decoder import decode_file, record_bus
 from hil.scenario import Scenario
-from hil.source import FileSource
+from hil.source import FileSource, scenario_table
 from nav.increments import ImuIncrements
 from nav.rotation import euler_from_quaternion
 from nav.state import NAV_STATE
@@ -210,3 +210,27 @@ def test_recording_a_port_and_what_other_formats_cannot_hold(port_file: Path, tm
             assert sum(len(batch) for batch in replayed(path, 64)) == made["frames"]
         else:
             assert made["not_exported"] == made["frames"]
+
+
+def test_a_port_that_is_pulled_out_while_it_is_recorded_is_told(port_file: Path, tmp_path: Path) -> None:
+    emulator, path, told = BOARDS["vectornav"][1](), tmp_path / "desk.dhil", list[str]()
+    with Plugged(emulator, port_file) as board:
+        pulled = threading.Timer(0.5, board.unplug)
+        with Feeder(board, emulator, standing_then_turning()):
+            pulled.start()
+            made = record_bus(
+                scenario("vectornav", f"serial:{port_file}:921600"), path, 2.0, lambda: bool(told), told.append
+            )
+    assert "the port is lost: unplugged?" in told[0]
+    assert made["problem"] == "the bus failed 1 times and was reopened"
+    assert made["frames"] > 10
+
+
+def test_a_recording_says_whose_it_is(tmp_path: Path) -> None:
+    path, batch = tmp_path / "a.dhil", frames(3)
+    bus = f"unix:{time.monotonic_ns():x}"
+    assert hil("record", path, "--bus", bus, "--imu", "sbg", "--duration", 0.1)[0]["frames"] == 0
+    with RecordingWriter(path, {"scenario": scenario_table(path)}) as writer:
+        writer.write(batch)
+    _, text = hil("replay", path, "--speed", "max", "--mavlink", "none", "--no-dashboard", code=2)
+    assert f"{path}: no sample of sbg in 3 frames: name its driver" in text

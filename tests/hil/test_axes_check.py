@@ -163,6 +163,14 @@ def test_requests_that_cannot_be_met(tmp_path: Path) -> None:
     monkey = tmp_path / "x.log"
     monkey.write_text("(1.0) can0 123#00\n")
     assert "give the driver with --imu" in hil("check-axes", monkey, code=2)[1]
+    assert f"{monkey}: no samples of sbg in it" in hil("check-axes", monkey, "--imu", "sbg", code=2)[1]
+
+
+def test_nobody_is_asked_for_a_posture_before_a_sample_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.axes_check.MUTE_S", 0.3)
+    said = hil("check-axes", "--bus", f"unix:axes-{time.monotonic_ns():x}", "--imu", "sbg", code=1)[1]
+    assert "no samples in 0.3 s: hil monitor shows what comes" in said
+    assert "1 of 6" not in said
 
 
 def standing(**head: Any) -> Scenario:

@@ -64,6 +64,9 @@ def test_silence_is_said_and_no_refusal(tmp_path: Path, monkeypatch: pytest.Monk
     with Plugged(None, path):
         assert "nothing comes" in check_port(f"serial:{path}:115200", "xsens-xbus", 0.05)
         assert probe(str(path), listen_s=0.01) is None
+        for driver in ("dtg-head", "dronecan-imu@7"):
+            with pytest.raises(HilError, match=f"a {driver} is at no serial port: .*--imu .*vectornav"):
+                check_port(f"serial:{path}:115200", driver, 0.05)
 
 
 def test_rubbish_is_nobody(tmp_path: Path) -> None:
