@@ -248,7 +248,7 @@ def configure(
     rate: Annotated[float, typer.Option(min=0.0, help="Samples a second, Hz.")],
     as_json: Json = False,
 ) -> None:
-    """Make a board on a serial port send what its driver wants; the board forgets it when it is switched off."""
+    """Make a board on a serial port send what its driver wants; it forgets it when it is switched off, but an Xsens keeps it."""
     from drivers.serial.setup import set_up
 
     report(set_up(driver, bus, rate), as_json=as_json)
