@@ -185,7 +185,8 @@ def run_part(control: Control, nice: int, aside: bool, target: Callable[..., Non
 
     A session that is killed cannot order anything: without this a simulated head would go on sending for ever.
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
+    for number in ENDINGS:
+        signal.signal(number, signal.SIG_IGN)
     os.nice(nice)
     if aside:
         step_aside()

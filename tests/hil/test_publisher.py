@@ -15,7 +15,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from hil.bridge import EVENTS
-from hil.control import Control
+from hil.control import Control, run_part
 from hil.publisher import Taps, run_publisher
 from hil.ring import Ring, Wake
 from hil.scenario import MavlinkConfig
@@ -41,7 +41,7 @@ class Running:
         self.events = Ring(EVENTS, 16, 0)
         taps = Taps(self.ring, 0, self.events, self.control)
         arguments = (MavlinkConfig(links=links, **config), taps, self.stop, report)
-        self.process = SPAWN.Process(target=run_publisher, args=arguments)
+        self.process = SPAWN.Process(target=run_part, args=(taps.control, 0, False, run_publisher, *arguments))
         self.process.start()
         report.close()
         self.row = np.zeros(1, NAV_STATE)
