@@ -26,6 +26,8 @@ WINDOW = 64
 """How far back a sample counts as late or duplicate rather than as a restart."""
 LONGEST_S = 60.0
 """After a longer gap the board counts as started anew."""
+FOLLOW = 8
+"""The grid of a board without a clock moves by one part in so many of what each arrival is off it."""
 FLIP = np.array([1.0, -1.0, -1.0])
 """Forward, left, up to forward, right, down, and back."""
 
@@ -115,7 +117,7 @@ def _take(
                 _learn(ticks, number, elapsed, grid, learnt, state)
                 _hold(raw[k], before, state)
             continue
-        period, delta, fits = state[_PERIOD], 0, True
+        period, delta, fits, off = state[_PERIOD], 0, True, 0
         if state[_UNIT] > 0 and number >= 0:
             delta = int(np.rint(signed(number - state[_LAST_NUMBER], 16) / state[_UNIT]))
             fits = abs(elapsed - delta * period) <= 0.5 * period * max(abs(delta), 1)
@@ -134,6 +136,7 @@ def _take(
                 while delta > -WINDOW and (state[_SEEN] >> -delta) & 1:
                     delta -= 1
                 delta = 1 if delta == -WINDOW else delta
+            off = elapsed - delta * period
             elapsed = delta * period
         if delta > 0 and fits:
             outcome[_LOST] += delta - 1
@@ -156,7 +159,7 @@ def _take(
             _learn(ticks, number, elapsed, grid, learnt, state)
             _hold(raw[k], before, state)
             continue
-        state[_LAST_TICKS] = ticks
+        state[_LAST_TICKS] = ticks - off + off // FOLLOW
         seconds = tick_s * (elapsed if delta == 1 else period)
         both = delta == 1  # ends of the step are there
         turn_is, push_is = int(raw[k, TURN_IS]), int(raw[k, PUSH_IS])
