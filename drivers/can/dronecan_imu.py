@@ -6,7 +6,7 @@ signature and the payload. Classic frames and CAN FD are understood. Source: Dro
 
 Taken are the integrals over the interval where the node sends them (single precision), else the latest rates and accelerations,
 which have 11 bits. Axes are forward, right, down already. Without a time stamp the clock is that of the arrival, whose period is
-whole milliseconds.
+the interval of the first message or a multiple of it; without an interval whole milliseconds, if that fits.
 """
 
 import struct
@@ -31,7 +31,7 @@ VALUES = struct.Struct("<f3e3f3e3f")
 """Behind the time (7 bytes): interval, latest rates, their integrals, latest accelerations, their integrals."""
 SIZE, LARGEST = 7 + VALUES.size, 128
 """Bytes of a message without its covariance; no transfer is longer."""
-TICK_S, GRID_S = 1e-6, 1e-3
+TICK_S, GRID_S, USUAL_S = 1e-6, 1e-3, 2e-3
 LONGEST_S = 1.0
 """Of an interval; a larger one is damage."""
 FITS = 0.02
@@ -149,7 +149,8 @@ class DronecanImu:
             return None
         if self._samples is None:
             self._stamped = time_us != 0
-            self._samples = Samples(self.counters, TICK_S, 0.0 if self._stamped else GRID_S)
+            grid_s, usual_s = (max(interval, TICK_S),) * 2 if whole else (GRID_S, USUAL_S)
+            self._samples = Samples(self.counters, TICK_S, 0.0 if self._stamped else grid_s, usual_s)
         if self._stamped and time_us == 0:
             return None
         kind, period = RATE, self._samples.period_s

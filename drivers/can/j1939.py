@@ -1,9 +1,9 @@
 """Driver of IMUs that speak SAE J1939: PGN 61482 (angular rates) and 61485 (accelerations) of one node to `ImuIncrements`.
 
 The messages (`fixtures/can/j1939_imu.dbc`) have neither time nor counter. A sample is one of each that come within three quarters
-of a period; the period is that of their arrival, a whole multiple of 5 ms, and time goes in such periods. The node is the
-one that is chosen or the first that is heard sending rates or accelerations; frames of all others are foreign. A frame with
-a value that is "not available" or an "error" is counted (`identity`) and not used. PGN 61481 (slope) is only shown.
+of a period; the period is that of their arrival, a whole multiple of 5 ms if that fits, and time goes in such periods. The node
+is the one that is chosen or the first that is heard sending rates or accelerations; frames of all others are foreign. A frame
+with a value that is "not available" or an "error" is counted (`identity`) and not used. PGN 61481 (slope) is only shown.
 
 Accelerations have their axes forward, left, up. Rates are those about forward, right, down: right wing down, nose up and
 to the right are positive; with ``z-up`` the rates too are those about forward, left, up. See `docs/boards/j1939-imu.md`.
@@ -25,7 +25,7 @@ from nav.increments import FloatArray, ImuIncrements, IntArray
 from nav.kernel import inline_kernel, kernel
 
 TICK_S = 1e-6
-GRID_S = 5e-3
+GRID_S, USUAL_S = 5e-3, 10e-3
 RATES = ("roll_rate", "pitch_rate", "yaw_rate")
 FORCES = ("longitudinal", "lateral", "vertical")
 HIGHEST = 0xFAFF
@@ -124,7 +124,7 @@ class J1939Imu:
         self._codecs = [(database["ARI"], RATES), (database["ACCS"], FORCES)]
         self._scale = np.radians(1.0) * turn, FLIP
         self.counters = Counters()
-        self._samples = Samples(self.counters, TICK_S, GRID_S)
+        self._samples = Samples(self.counters, TICK_S, GRID_S, USUAL_S)
         self._state, self._held = np.array([-1, 0, 0, 0, 0, 0]), np.zeros(4)
         self._unavailable = 0
         self._identity: dict[str, object] = {}

@@ -1,8 +1,10 @@
 """Samples of a board that counts nothing, or little: which are missing, late or twice, and the increments that they make.
 
 A board's driver puts what it has read into rows of `RAW` columns; `Samples` judges them and turns rates into increments, once and
-here. The first `LEARN` + 1 samples of a life only set the clock: the median of their distances is the sample period. From then on
-a sample is placed by the board's counter where it sends one, else by its time in whole periods:
+here. The first `LEARN` + 1 samples of a life only set the clock: the median of their distances is the sample period. Of a board
+without a clock it is their mean, on a grid; where that is off the grid, `LEARN_LONG` + 1 samples set the clock and the period is
+the mean itself. It is measured again every `MEASURE` samples. From then on a sample is placed by the board's counter where it
+sends one, else by its time in whole periods:
 
 - the next one or a later one is taken, what is missing between counts as lost;
 - one of the last 63 that was not seen yet comes late, one that was seen is a duplicate; both are dropped;
@@ -22,6 +24,12 @@ from nav.kernel import inline_kernel, kernel
 
 LEARN = 9
 """Distances between samples from which the period is learnt."""
+LEARN_LONG = 99
+"""The same where it is on no grid."""
+ON_GRID = 0.02
+"""A mean that is a multiple of the grid but for this part is that multiple."""
+MEASURE, WRONG = 256, 0.005
+"""Samples over which the period of a board without a clock is measured, and the part by which it is wrong then."""
 WINDOW = 64
 """How far back a sample counts as late or duplicate rather than as a restart."""
 LONGEST_S = 60.0
@@ -36,7 +44,20 @@ FLIP = np.array([1.0, -1.0, -1.0])
 TICKS, NUMBER, BAD, TURN, PUSH, TURN_IS, PUSH_IS, RAW = 0, 1, 2, 3, 6, 9, 10, 11
 RATE, MEAN_RATE, INCREMENT = 0, 1, 2
 
-_LEARNT, _LAST_TICKS, _LAST_NUMBER, _TIME, _SEQUENCE, _SEEN, _PERIOD, _UNIT, _TURN_HELD, _PUSH_HELD = range(10)
+(
+    _LEARNT,
+    _LAST_TICKS,
+    _LAST_NUMBER,
+    _TIME,
+    _SEQUENCE,
+    _SEEN,
+    _PERIOD,
+    _UNIT,
+    _TURN_HELD,
+    _PUSH_HELD,
+    _FROM_TICKS,
+    _FROM,
+) = range(12)
 _SAMPLES, _LOST, _DUPLICATED, _LATE, _RESTARTS, _FROZEN, _CLOCK_STEPS, _OUTCOMES = range(8)
 
 
@@ -65,7 +86,18 @@ def _hold(row: FloatArray, before: FloatArray, state: IntArray) -> None:
 
 
 @inline_kernel
-def _learn(ticks: int, number: int, elapsed: int, grid: int, learnt: IntArray, state: IntArray) -> None:
+def _mean_without_gaps(distances: IntArray) -> float:
+    """Mean of the distances that are not nearly two, so that a lost sample does not lengthen it."""
+    longest = 1.75 * distances.mean()
+    total = n = 0
+    for distance in distances:
+        if distance <= longest:
+            total, n = total + distance, n + 1
+    return total / n
+
+
+@inline_kernel
+def _learn(ticks: int, number: int, elapsed: int, grid: int, usual: int, learnt: IntArray, state: IntArray) -> None:
     """Take one sample of those that only set the clock."""
     at = state[_LEARNT]
     if at < 0 or elapsed < 0:
@@ -76,16 +108,37 @@ def _learn(ticks: int, number: int, elapsed: int, grid: int, learnt: IntArray, s
         state[_LEARNT] += 1
         state[_TIME] += elapsed
     state[_LAST_TICKS], state[_LAST_NUMBER] = ticks, number
-    if state[_LEARNT] == LEARN:
-        period = np.sort(learnt[0])[LEARN // 2]
-        if grid > 0:
-            period = int(np.rint(period / grid)) * grid
-            if period == 0:
-                period = 2 * grid
-            state[_TIME] = (LEARN + 1) * period
-        state[_PERIOD] = period
-        state[_UNIT] = np.sort(learnt[1])[LEARN // 2] if learnt[1].min() > 0 else 0
-        state[_SEEN] = -1  # one from before was never counted as lost
+    n = state[_LEARNT]
+    if n not in (LEARN, LEARN_LONG):
+        return
+    period = np.sort(learnt[0, :n])[n // 2]
+    if grid > 0:
+        mean = _mean_without_gaps(learnt[0, :n])
+        period = int(np.rint(mean / grid)) * grid
+        if mean == 0.0:
+            period = usual
+        elif abs(mean - period) > ON_GRID * period:
+            if n == LEARN:
+                return
+            period = int(np.rint(mean))
+        state[_TIME] = (n + 1) * period
+        state[_FROM_TICKS], state[_FROM] = ticks, state[_SEQUENCE]
+    state[_PERIOD] = period
+    state[_UNIT] = np.sort(learnt[1, :n])[n // 2] if learnt[1, :n].min() > 0 else 0
+    state[_SEEN] = -1  # one from before was never counted as lost
+    state[_LEARNT] = LEARN_LONG
+
+
+@inline_kernel
+def _measure(state: IntArray) -> None:
+    """Correct the period by the distance that the grid has moved while it followed the arrivals."""
+    n = state[_SEQUENCE] - state[_FROM]
+    if n < MEASURE:
+        return
+    mean = signed(state[_LAST_TICKS] - state[_FROM_TICKS], 32) / n
+    if abs(mean - state[_PERIOD]) > WRONG * state[_PERIOD]:
+        state[_PERIOD] = int(np.rint(mean))
+    state[_FROM_TICKS], state[_FROM] = state[_LAST_TICKS], state[_SEQUENCE]
 
 
 @kernel
@@ -93,6 +146,7 @@ def _take(
     raw: FloatArray,
     tick_s: float,
     grid: int,
+    usual: int,
     learnt: IntArray,
     before: FloatArray,
     state: IntArray,
@@ -110,11 +164,11 @@ def _take(
     for k in range(raw.shape[0]):
         ticks, number = int(raw[k, TICKS]), int(raw[k, NUMBER])
         elapsed = signed(ticks - state[_LAST_TICKS], 32)
-        if state[_LEARNT] < LEARN:
+        if state[_LEARNT] < LEARN_LONG:
             if state[_LEARNT] >= 0 and elapsed == 0 and grid == 0:
                 outcome[_DUPLICATED] += 1
             else:
-                _learn(ticks, number, elapsed, grid, learnt, state)
+                _learn(ticks, number, elapsed, grid, usual, learnt, state)
                 _hold(raw[k], before, state)
             continue
         period, delta, fits, off = state[_PERIOD], 0, True, 0
@@ -128,6 +182,9 @@ def _take(
                 outcome[_CLOCK_STEPS] += 1
                 elapsed, fits = period, True
         else:
+            if grid > 0 and elapsed < -period:  # no arrival is that early: the host's clock was set back
+                state[_FROM_TICKS] += elapsed - period
+                elapsed = period
             delta = int(np.rint(elapsed / period))
         fits = fits and elapsed * tick_s <= LONGEST_S
         if grid > 0 and fits:
@@ -156,10 +213,12 @@ def _take(
             outcome[_RESTARTS] += 1
             state[_SEQUENCE] += 2  # any jump: the navigator sees that time does not go on
             state[_LEARNT] = -1
-            _learn(ticks, number, elapsed, grid, learnt, state)
+            _learn(ticks, number, elapsed, grid, usual, learnt, state)
             _hold(raw[k], before, state)
             continue
         state[_LAST_TICKS] = ticks - off + off // FOLLOW
+        if grid > 0:
+            _measure(state)
         seconds = tick_s * (elapsed if delta == 1 else period)
         both = delta == 1  # ends of the step are there
         turn_is, push_is = int(raw[k, TURN_IS]), int(raw[k, PUSH_IS])
@@ -185,14 +244,17 @@ class Samples:
     tick_s : float
         One tick of the clock, s; the clock has 32 bits.
     grid_s : float
-        Of a board without a clock, whose ticks are those of the arrival: its period is a whole multiple of this, or twice this
-        where arrivals tell none. Time then goes in whole periods. 0: the board has a clock.
+        Of a board without a clock, whose ticks are those of the arrival: its period is a whole multiple of this where arrivals
+        agree. Time then goes in whole periods. 0: the board has a clock.
+    usual_s : float
+        The period of a board without a clock whose arrivals tell none.
     """
 
-    def __init__(self, counters: Counters, tick_s: float, grid_s: float = 0.0) -> None:
-        self._counters, self._tick_s, self._grid = counters, tick_s, round(grid_s / tick_s)
-        self._learnt, self._before = np.zeros((2, LEARN), np.int64), np.zeros(6)
-        self._state, self._outcome = np.zeros(10, np.int64), np.zeros(_OUTCOMES, np.int64)
+    def __init__(self, counters: Counters, tick_s: float, grid_s: float = 0.0, usual_s: float = 0.0) -> None:
+        self._counters, self._tick_s = counters, tick_s
+        self._grid, self._usual = round(grid_s / tick_s), round(usual_s / tick_s)
+        self._learnt, self._before = np.zeros((2, LEARN_LONG), np.int64), np.zeros(6)
+        self._state, self._outcome = np.zeros(12, np.int64), np.zeros(_OUTCOMES, np.int64)
         self._state[_LEARNT] = -1
         self._room(256)
 
@@ -214,6 +276,7 @@ class Samples:
             raw,
             self._tick_s,
             self._grid,
+            self._usual,
             self._learnt,
             self._before,
             self._state,

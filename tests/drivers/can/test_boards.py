@@ -22,7 +22,7 @@ from drivers.can.emulation import EndRates
 from drivers.can.frames import EFF, ERR, FDF, RTR, frames
 from drivers.can.j1939 import J1939Imu
 from drivers.can.j1939_emulator import J1939Emulator
-from drivers.can.samples import LEARN
+from drivers.can.samples import LEARN, LEARN_LONG
 from drivers.can.sbg_emulator import SbgEmulator
 from drivers.can.xsens import Xsens, rotation_vector
 from drivers.can.xsens_emulator import XsensEmulator
@@ -565,12 +565,44 @@ def test_arrivals_that_jitter_move_the_grid_only_slowly(seed):
     """Frames held up by 0 to 6 ms of 10: what is missing was left out, and no sample is late."""
     n, rng = 3000, np.random.default_rng(seed)
     batch = sent("j1939-imu", n)
-    gone = np.flatnonzero(rng.uniform(size=n - SET_CLOCK - 1) < 0.02) + SET_CLOCK
+    gone = np.flatnonzero(rng.uniform(size=n - LEARN_LONG - 2) < 0.02) + LEARN_LONG + 1
     batch["time_ns"] += rng.integers(0, 6_000_000, (n, 1))
     driver = driver_of("j1939-imu")
     out = fed(driver, np.delete(batch, gone, axis=0))
     assert faults(driver) == {"lost": len(gone)}
-    assert numbers(out, "j1939-imu").tolist() == sorted(set(range(SET_CLOCK, n)) - {*gone.tolist()})
+    found = numbers(out, "j1939-imu")
+    assert found[0] <= LEARN_LONG + 1
+    assert found.tolist() == sorted(set(range(found[0], n)) - {*gone.tolist()})
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.5])
+@pytest.mark.parametrize("rate_hz", [20.0, 33.0, 62.5, 80.0, 100.0, 125.0, 200.0])
+def test_any_rate_of_a_board_without_a_clock_is_found(rate_hz, jitter):
+    """On the grid or off it, with 2 % lost: a turn is as large as it was, none is invented or missed."""
+    n, rng = 1500, np.random.default_rng(7)
+    batch = np.concatenate([sent("j1939-imu", 1)] * n)
+    start = np.arange(n) + rng.uniform(0.0, jitter, n)
+    batch["time_ns"] = np.rint(1e9 / rate_hz * start)[:, None] + [0, 150_000]
+    gone = np.flatnonzero(rng.uniform(size=n - 1) < 0.02)
+    driver = driver_of("j1939-imu")
+    out = fed(driver, np.delete(batch, gone, axis=0))
+    first = n - round((out["time"][-1] - out["time"][0]) * rate_hz) - 1
+    assert first < 120
+    assert faults(driver) == {"lost": np.count_nonzero(gone > first)}
+    np.testing.assert_allclose(out["step"][-1000:], 1.0 / rate_hz, rtol=5e-3)
+
+
+@pytest.mark.parametrize(("step_s", "lost"), [(-0.5, 0), (-3.0, 0), (-200.0, 0), (0.5, 50)])
+def test_the_hosts_clock_is_set(step_s, lost):
+    """Back: nobody takes it for lost samples, time and period go on. Forward: it looks like a gap, and then all is well."""
+    batch = sent("j1939-imu", 900)
+    batch["time_ns"][300:] += round(1e9 * (step_s + 300.0))
+    batch["time_ns"][:300] += 300_000_000_000
+    driver = driver_of("j1939-imu")
+    out = fed(driver, batch)
+    assert faults(driver) == ({"lost": lost} if lost else {})
+    assert driver.period_s == pytest.approx(0.01)
+    assert numbers(out, "j1939-imu")[-1] == 899 + lost
 
 
 @pytest.mark.parametrize("name", ["j1939-imu@0x17", "j1939-imu@z-up", "j1939-imu@23,z-up", "dronecan-imu@7"])

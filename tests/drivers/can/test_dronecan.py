@@ -16,7 +16,7 @@ from drivers.can.bus import open_port
 from drivers.can.dronecan_imu import BASE_CRC, DronecanImu
 from drivers.can.dronecan_imu_emulator import DronecanEmulator
 from drivers.can.frames import BRS, EFF, FDF, frames
-from drivers.can.samples import LEARN
+from drivers.can.samples import LEARN, LEARN_LONG
 from nav.errors import HilError
 from nav.increments import ImuIncrements
 
@@ -115,6 +115,24 @@ def test_without_stamps_time_goes_by_the_arrival():
     np.testing.assert_array_equal(arrivals, batch["time_ns"][FRAMES - 1 :: FRAMES][SET_CLOCK:])
     assert len(out) == 100 - SET_CLOCK
     assert driver.identity() == {"node": 42, "time_stamps": False}
+
+
+@pytest.mark.parametrize("rate_hz", [300.0, 400.0, 600.0])
+@pytest.mark.parametrize("integrals", [False, True])
+def test_without_stamps_any_rate_is_found(rate_hz, integrals):
+    """An interval that the node sends is the period at once; else it is what the arrivals say, whole milliseconds or not."""
+    n = 400
+    imu = smooth(n)
+    imu.step[:] = 1.0 / rate_hz
+    batch = DronecanEmulator(5000, stamped=False, integrals=integrals).samples(imu).reshape(n, FRAMES)
+    batch["time_ns"] = np.rint(1e9 / rate_hz * np.arange(n))[:, None] + 1000 * np.arange(FRAMES)
+    driver = DronecanImu()
+    out, times, _ = fed(driver, batch.reshape(-1), range(0, FRAMES * n, FRAMES))
+    assert faults(driver) == {}
+    assert len(out) == (n - SET_CLOCK if integrals else n - LEARN_LONG - 1)
+    np.testing.assert_allclose(np.diff(times), 1.0 / rate_hz, rtol=1e-3)
+    if integrals:
+        np.testing.assert_allclose(out[:, :3], imu.dtheta[SET_CLOCK:], rtol=1e-6, atol=1e-9)
 
 
 @given(st.integers(SET_CLOCK, 78), st.integers(0, FRAMES - 1), st.lists(st.integers(0, 560), max_size=8))
