@@ -6,7 +6,7 @@ A board is one module with one class that satisfies `FrameDriver`, found by the 
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from inspect import signature
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from drivers.can.frames import FrameArray
 from nav.errors import HilError
@@ -32,7 +32,7 @@ class Counters:
     foreign: int = 0
     """Frames with an id that is not the board's; ignored."""
     short: int = 0
-    """Frames of the board's id with the wrong length or kind; dropped."""
+    """Frames of the board's id with the wrong length or kind, or that for seconds make no sample; dropped."""
     version_errors: int = 0
     """Frames of another protocol version; dropped."""
     restarts: int = 0
@@ -68,6 +68,14 @@ class FrameDriver(Protocol):
 
     def identity(self) -> dict[str, object]:
         """What the board says of itself: serial, temperatures, built-in test."""
+
+
+@runtime_checkable
+class Selective(Protocol):
+    """A driver of a board whose messages are switched on one by one, so that one may be missing."""
+
+    def lacking(self) -> str:
+        """Why there are no samples though the board's frames come, and what to do; empty while there are."""
 
 
 class BoardEmulator(Protocol):

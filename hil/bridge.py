@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import FrameDriver, make_driver
+from drivers import FrameDriver, Selective, make_driver
 from drivers.can.aiding import AidingDecoder, has_aiding, is_aiding
 from drivers.can.dtg_head import DtgHead
 from drivers.can.frames import FrameArray, frames
@@ -150,7 +150,8 @@ class Loop:
         """The scenario's duration is over."""
         self.samples = 0
         """Navigated so far."""
-        self._watch = WireWatch(self.driver.counters, scenario.bus)
+        selective = self.driver if isinstance(self.driver, Selective) else None
+        self._watch = WireWatch(self.driver.counters, scenario.bus, selective)
         self._aiding = AidingDecoder()
         self._now: float | None = None
         """Device time of the newest sample."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers import FrameDriver, driver_names, make_driver
+from drivers import FrameDriver, Selective, driver_names, make_driver
 from drivers.can.codec import Database, MessageCodec
 from drivers.can.frames import EFF, ERR, FrameArray
 from drivers.can.wire import bits
@@ -160,6 +160,7 @@ class Monitor:
             "frames_hz": frames.rate_hz,
             "load": self._load(frames, recent=recent),
             "signals": [one.row(now_ns, recent=recent) for one in self._signals.values()],
+            "lacking": {name: text for name, one in self._drivers.items() if (text := _lacking(one))},
             "ids": [self._id_row(key, now_ns, recent=recent) for key in sorted(self._ids)],
             "losses": self._losses | _lost(driver) | _port_losses(port),
         }
@@ -230,6 +231,10 @@ class Monitor:
             return None
         least, most = (run.shown(recent=recent) for run in (self._busy, self._most))
         return {"least": least.mean * least.count / span, "most": most.mean * most.count / span}
+
+
+def _lacking(driver: FrameDriver) -> str:
+    return driver.lacking() if isinstance(driver, Selective) else ""
 
 
 def _lost(driver: FrameDriver | None) -> dict[str, int]:

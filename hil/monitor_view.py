@@ -57,7 +57,7 @@ def headline(report: dict[str, Any]) -> str:
         report["driver"] or "no known board",
         *(f"{name} {count}" for name, count in report["losses"].items() if count),
     ]
-    return "  ".join(parts)
+    return "  ".join([*parts, *(f"{name}: {text}" for name, text in report["lacking"].items())])
 
 
 def tables(report: dict[str, Any]) -> RenderableType:

@@ -6,7 +6,7 @@ So a bad wire fills no screen; the counters of the summary have the rest. Nothin
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from drivers import Counters
+from drivers import Counters, Selective
 from drivers.can.bus_errors import BusErrors, is_error
 from drivers.can.frames import FrameArray
 
@@ -18,7 +18,7 @@ FRAMES = {
     "late": "samples come behind later ones",
     "crc_errors": "frames fail their check",
     "foreign": "frames of another sender",
-    "short": "frames have a wrong length or lack a value",
+    "short": "frames have a wrong length, lack a value or make no sample",
     "version_errors": "frames are of another protocol version",
     "frozen": "the counter of the samples stands still while their time goes on",
     "clock_steps": "the sensor's clock jumped and its samples went on: time goes on with them",
@@ -60,10 +60,14 @@ class _Fault:
 
 
 class WireWatch:
-    """Looks at the counters of a driver after each batch; `bus` is the URL, for the commands that mend."""
+    """Looks at the counters of a driver after each batch; `bus` is the URL, for the commands that mend.
 
-    def __init__(self, counters: Counters, bus: str) -> None:
+    A `selective` driver is asked for what is lacking too.
+    """
+
+    def __init__(self, counters: Counters, bus: str, selective: Selective | None = None) -> None:
         self._counters, self._names = counters, list(counters.as_dict())[_FIRST:]
+        self._selective, self._lacking = selective, ""
         self._before, self._faults = counters.as_list()[_FIRST:], dict[str, _Fault]()
         kind, _, place = bus.partition("?")[0].partition(":")
         self._interface = place if kind == "socketcan" else "can0"
@@ -72,11 +76,16 @@ class WireWatch:
 
     def look(self, batch: FrameArray, counts: list[int], now_s: float) -> Iterable[Said]:
         """What is new with the counters `counts` after `batch`, at the device time `now_s`."""
-        if not self._faults and counts[_FIRST:] == self._before:
+        if not self._faults and counts[_FIRST:] == self._before and not self._lacking:
             return ()
         return self._news(batch, counts, now_s)
 
     def _news(self, batch: FrameArray, counts: list[int], now_s: float) -> Iterator[Said]:
+        lacking = "" if self._selective is None else self._selective.lacking()
+        if lacking != self._lacking:
+            self._lacking = lacking
+            if lacking:
+                yield Said("warning", lacking, station=True)
         if counts[_FIRST:] != self._before:
             before, self._before = dict(zip(self._names, self._before, strict=True)), counts[_FIRST:]
             for name, count in zip(self._names, self._before, strict=True):

@@ -3,7 +3,8 @@
 A sample is the frame that opens it and one frame of each kind that the board was seen sending in the two samples before; it
 is complete with the last of these, and the first sample of all when the next one opens. A frame of the next sample whose
 opening frame was lost is told by its arrival, more than one period after the opening one before it, or by a kind that
-comes again with other content. What stays incomplete is dropped, and missing by time or counter.
+comes again with other content. What stays incomplete is dropped, and missing by time or counter; what never makes a sample
+is counted as short, and the user is told (:mod:`drivers.can.lacking`).
 """
 
 from collections.abc import Collection, Mapping
@@ -15,6 +16,7 @@ from drivers import Counters
 from drivers.can.aiding import is_aiding
 from drivers.can.codec import MessageCodec
 from drivers.can.frames import FDF, FrameArray
+from drivers.can.lacking import LACK, made, told, wait
 from drivers.can.samples import (
     BAD,
     NUMBER,
@@ -35,6 +37,8 @@ TURN_RATE, TURN_DELTA, PUSH_RATE, PUSH_DELTA, COUNTER, OPENING, STATUS, OTHER = 
 """Kinds of frames: rates and increments of turn and velocity, counter, what opens a sample (ticks, whether it is bad), what says
 whether samples from here on are bad, and what is not of a sample."""
 _KINDS = 5
+BACK = 3
+"""Times that the clock may go back before there is a sample."""
 _OPEN, _SENT, _HAVE, _BEFORE, _DUE, _TICKS, _BAD, _OPENED_NS, _SPAN_NS = range(9)
 
 
@@ -76,11 +80,12 @@ def _join(
     delta_is: int,
     state: IntArray,
     held: FloatArray,
+    lack: IntArray,
     raw: FloatArray,
     rows: IntArray,
-) -> tuple[int, int]:
-    """Raw samples out of frames in the order of their arrival; (samples, frames that came twice)."""
-    n = duplicated = 0
+) -> tuple[int, int, int]:
+    """Raw samples out of frames in the order of their arrival; (samples, frames that came twice, frames that make no sample)."""
+    n = duplicated = useless = 0
     for k in range(kind.shape[0]):
         what = kind[k]
         if what < 0 or what == OTHER:
@@ -88,6 +93,7 @@ def _join(
         if what == STATUS:
             state[_BAD] = int(value[k, 0])
             continue
+        useless += wait(what, arrival[k], lack)
         if what == OPENING:
             ticks = int(value[k, 0])
             if state[_OPEN]:
@@ -97,6 +103,7 @@ def _join(
                     continue
                 if state[_DUE] == 0 and state[_SENT] == 0 and _is_whole(state[_HAVE]):
                     _put(state, held, turn_delta, delta_is, raw[n])
+                    made(lack)
                     rows[n] = k
                     n += 1
                 state[_DUE], state[_BEFORE] = state[_HAVE] | state[_BEFORE], state[_HAVE]
@@ -125,10 +132,11 @@ def _join(
         due = state[_DUE]
         if due != 0 and state[_SENT] == 0 and state[_HAVE] & due == due and _is_whole(state[_HAVE]):
             _put(state, held, turn_delta, delta_is, raw[n])
+            made(lack)
             rows[n] = k
             n += 1
             state[_SENT] = 1
-    return n, duplicated
+    return n, duplicated, useless
 
 
 class Groups:
@@ -138,6 +146,8 @@ class Groups:
     ----------
     kinds : mapping
         Kind of each message that the driver reads, by its codec; `OTHER` for one that is not of a sample.
+    names : (str, str, str)
+        What the user calls the messages that open a sample, that carry the turn and that carry the velocity.
     others : collection of int
         Identifiers of the board's other messages.
     tick_s : float
@@ -156,13 +166,16 @@ class Groups:
         *,
         turn_delta: bool,
         delta_is: int,
+        names: tuple[str, str, str],
         others: Collection[int] = (),
     ) -> None:
         self._kinds, self._tick_ns = dict(kinds), round(tick_s * 1e9)
         self._ids, self._others = [codec.can_id for codec in kinds], list(others)
         self._turn_delta, self._delta_is, self._counters = turn_delta, delta_is, counters
         self._samples = Samples(counters, tick_s)
-        self._state, self._held = np.zeros(9, np.int64), np.zeros((_KINDS, 3))
+        self._state, self._held, self._lack = np.zeros(9, np.int64), np.zeros((_KINDS, 3)), np.zeros(LACK, np.int64)
+        self._wanted = tuple(zip((1 << OPENING, 0b0011, 0b1100), names, strict=True))
+        self._restarts = 0
         self.arrivals: IntArray = np.zeros(0, np.int64)
         """Arrival (ns) of the last frame of each sample of the last `take`."""
 
@@ -170,6 +183,12 @@ class Groups:
     def period_s(self) -> float | None:
         """Sample period, s, once learnt."""
         return self._samples.period_s
+
+    def lacking(self) -> str:
+        """Why there are no samples though frames come; empty while there are."""
+        if self._counters.restarts - self._restarts > BACK:
+            return "the clock of the samples goes back again and again: do two boards send the same messages?"
+        return told(self._lack, self._wanted)
 
     def sorted(self, batch: FrameArray) -> tuple[IntArray, dict[MessageCodec, tuple[IntArray, NDArray[np.uint8]]]]:
         """Kind of each frame (-1: not of the board), and rows and payloads of each message; counts what is not of the board."""
@@ -193,7 +212,7 @@ class Groups:
     def take(self, kind: IntArray, value: FloatArray, arrival: IntArray) -> ImuIncrements:
         """Increments out of frames of `kind` (n,) with what they say (n, 3), body axes; views until the next call."""
         raw, rows = np.empty((len(kind), RAW)), np.empty(len(kind), np.int64)
-        n, duplicated = _join(
+        n, duplicated, useless = _join(
             kind,
             value,
             arrival,
@@ -202,11 +221,15 @@ class Groups:
             self._delta_is,
             self._state,
             self._held,
+            self._lack,
             raw,
             rows,
         )
         self._counters.duplicated += duplicated
+        self._counters.short += useless
         imu, taken = self._samples.take(raw[:n])
+        if len(imu):
+            self._restarts = self._counters.restarts
         self.arrivals = arrival[rows[taken]]
         return imu
 
@@ -224,6 +247,10 @@ class GroupedBoard:
     def period_s(self) -> float | None:
         """Sample period, s, once learnt."""
         return self._groups.period_s
+
+    def lacking(self) -> str:
+        """See `drivers.Selective`."""
+        return self._groups.lacking()
 
     def identity(self) -> dict[str, object]:
         """Status and temperature, as last heard."""

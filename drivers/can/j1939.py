@@ -19,6 +19,7 @@ from drivers import Counters
 from drivers.can.aiding import is_aiding
 from drivers.can.codec import Database, MessageCodec, load_database
 from drivers.can.frames import EFF, ERR, FDF, RTR, FrameArray
+from drivers.can.lacking import HEARD, LACK, LACKS, made, told, wait
 from drivers.can.samples import BAD, FLIP, NUMBER, PUSH, PUSH_IS, RATE, RAW, TICKS, TURN, TURN_IS, Samples
 from nav.errors import HilError
 from nav.increments import FloatArray, ImuIncrements, IntArray
@@ -32,7 +33,9 @@ HIGHEST = 0xFAFF
 """Raw 16-bit values above are reserved, errors or not available; of 24-bit ones those above this and eight ones."""
 DEGRADED, FAILED = 1, 2
 """Figures of merit: suspect; an error. 0 is good, 3 says nothing."""
-_TURN, _PUSH = 0, 1
+_TURN, _PUSH, _NONE = 0, 1, 2
+"""Kinds of frames; what is not available is of the kind that it would be and `_NONE`."""
+NAMES = ("PGN 61482 (rates)", "PGN 61485 (accelerations)")
 _HELD, _HELD_NS, _LAST_NS, _SPAN_NS = 0, 1, 2, 4  # the last two for each kind
 
 
@@ -62,13 +65,17 @@ def _pair(
     arrival: IntArray,
     state: IntArray,
     held: FloatArray,
+    lack: IntArray,
     raw: FloatArray,
     rows: IntArray,
-) -> int:
-    """Raw samples out of good frames of rates and accelerations in the order of their arrival."""
-    n = 0
+) -> tuple[int, int]:
+    """Raw samples out of frames of rates and accelerations in the order of their arrival; (samples, frames that make none)."""
+    n = useless = 0
     for k in range(kind.shape[0]):
         what, now = kind[k], arrival[k]
+        useless += wait(what, now, lack)
+        if what >= _NONE:
+            continue
         if state[_LAST_NS + what]:
             state[_SPAN_NS + what] = _usual(state[_SPAN_NS + what], now - state[_LAST_NS + what])
         state[_LAST_NS + what] = now
@@ -83,10 +90,11 @@ def _pair(
         raw[n, BAD] = 1.0 if value[k, 3] + held[3] > 0.0 else 0.0
         raw[n, TICKS], raw[n, NUMBER] = (now // 1000) % (1 << 32), -1.0
         raw[n, TURN_IS] = raw[n, PUSH_IS] = RATE
+        made(lack)
         rows[n] = k
         n += 1
         state[_HELD] = -1
-    return n
+    return n, useless
 
 
 def node_of(option: str) -> tuple[int | None, FloatArray]:
@@ -125,7 +133,7 @@ class J1939Imu:
         self._scale = np.radians(1.0) * turn, FLIP
         self.counters = Counters()
         self._samples = Samples(self.counters, TICK_S, GRID_S, USUAL_S)
-        self._state, self._held = np.array([-1, 0, 0, 0, 0, 0]), np.zeros(4)
+        self._state, self._held, self._lack = np.array([-1, 0, 0, 0, 0, 0]), np.zeros(4), np.zeros(LACK, np.int64)
         self._unavailable = 0
         self._identity: dict[str, object] = {}
         self._arrivals: IntArray = np.zeros(0, np.int64)
@@ -138,6 +146,13 @@ class J1939Imu:
     def identity(self) -> dict[str, object]:
         """Source address, frames that were not available or errors, pitch and roll as last heard."""
         return self._identity | {"source_address": self._source, "unavailable": self._unavailable}
+
+    def lacking(self) -> str:
+        """See `drivers.Selective`."""
+        for what, name in enumerate(NAMES):
+            if self._lack[LACKS] and self._lack[HEARD] >> what & 0b101 == 0b100:
+                return f"{name}: every frame says that its values are not available, or errors"
+        return told(self._lack, ((1 << what, name) for what, name in enumerate(NAMES)))
 
     def arrivals(self) -> IntArray:
         """Arrival (ns) of the last frame of each sample of the last `decode`."""
@@ -167,7 +182,7 @@ class J1939Imu:
             if len(rows):
                 good, value[rows, 3], vectors = _said(codec, names, batch["data"][rows, :8])
                 value[rows, :3] = self._scale[what] * vectors
-                kind[rows[good]] = what
+                kind[rows] = np.where(good, what, what + _NONE)
                 self._unavailable += int(len(rows) - good.sum())
         if (rows := np.flatnonzero(is_slope & whole)).size:
             self._show(batch["data"][rows[-1:], :8])
@@ -176,7 +191,8 @@ class J1939Imu:
     def _join(self, kind: IntArray, value: FloatArray, arrival: IntArray) -> ImuIncrements:
         used = np.flatnonzero(kind >= 0)
         raw, rows = np.empty((len(used), RAW)), np.empty(len(used), np.int64)
-        n = _pair(kind[used], value[used], arrival[used], self._state, self._held, raw, rows)
+        n, useless = _pair(kind[used], value[used], arrival[used], self._state, self._held, self._lack, raw, rows)
+        self.counters.short += useless
         imu, taken = self._samples.take(raw[:n])
         self._arrivals = arrival[used[rows[taken]]]
         return imu

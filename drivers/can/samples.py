@@ -168,6 +168,7 @@ def _take(
             if state[_LEARNT] >= 0 and elapsed == 0 and grid == 0:
                 outcome[_DUPLICATED] += 1
             else:
+                outcome[_RESTARTS] += state[_LEARNT] >= 0 and elapsed < 0
                 _learn(ticks, number, elapsed, grid, usual, learnt, state)
                 _hold(raw[k], before, state)
             continue

@@ -28,6 +28,8 @@ VECTORS = {
     "IMU_DELTA_ANGLE": (TURN_DELTA, "DELTA_ANGLE"),
 }
 """Kind of each message that carries a vector, and how its signals begin."""
+NAMES = ("IMU_INFO", "IMU_GYRO", "IMU_ACCEL")
+"""Messages without which there is no sample."""
 
 
 @cache
@@ -48,7 +50,7 @@ class Sbg(GroupedBoard):
             kinds[codec] = kind
             self._columns[codec.name] = [codec.columns[f"{signal}_{axis}"] for axis in "XYZ"]
         counters, others = Counters(), database.by_id.keys() - {codec.can_id for codec in kinds}
-        groups = Groups(kinds, TICK_S, counters, turn_delta=True, delta_is=MEAN_RATE, others=others)
+        groups = Groups(kinds, TICK_S, counters, turn_delta=True, delta_is=MEAN_RATE, names=NAMES, others=others)
         super().__init__(counters, groups)
 
     def decode(self, batch: FrameArray) -> ImuIncrements:

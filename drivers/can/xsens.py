@@ -46,6 +46,8 @@ KINDS = {
     "XCDI_Acceleration": PUSH_RATE,
     "XCDI_Temperature": OTHER,
 }
+NAMES = ("SampleTime", "RateOfTurn", "DeltaV")
+"""Messages without which there is no sample."""
 
 
 @cache
@@ -70,7 +72,7 @@ class Xsens(GroupedBoard):
         database = xsens_database()
         kinds = {database[name]: kind for name, kind in KINDS.items()}
         counters = Counters()
-        super().__init__(counters, Groups(kinds, TICK_S, counters, turn_delta=False, delta_is=INCREMENT))
+        super().__init__(counters, Groups(kinds, TICK_S, counters, turn_delta=False, delta_is=INCREMENT, names=NAMES))
 
     def decode(self, batch: FrameArray) -> ImuIncrements:
         """The samples that `batch` completes, in order; valid until the next call."""

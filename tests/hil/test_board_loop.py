@@ -8,7 +8,9 @@ import pytest
 
 from drivers import make_emulator
 from drivers.can.unix_bus import UnixPort
-from hil.bridge import Loop, LoopOrder, Outlets
+from hil.bridge import EVENTS, Loop, LoopOrder, Outlets
+from hil.monitor import Monitor
+from hil.monitor_view import headline
 from hil.scenario import Scenario
 from hil.world.head import SimulatedHead
 from nav.errors import HilError
@@ -47,6 +49,28 @@ def scenario(driver, **head):
 def frames_of(chosen):
     samples = round(chosen.duration_s * chosen.head.rate_hz)
     return np.concatenate([part for _, *parts in SimulatedHead(chosen).chunks(samples) for part in parts])
+
+
+def test_a_message_that_is_switched_off_is_told():
+    """By the run, to ground stations too, and once; and by the monitor, which looks for a board."""
+    chosen = scenario("sbg")
+    batch = frames_of(chosen)
+    batch = batch[batch["can_id"] != 0x122]
+    outlets = Outlets.make(recording=False, readers=1)
+    loop, monitor = Loop(LoopOrder(chosen, paced=False), outlets), Monitor(None)
+    for part in np.array_split(batch, 50):
+        loop.take(part)
+        monitor.take(part)
+    events = np.zeros(256, EVENTS)
+    told, _ = outlets.events.pull(events, 0)
+    said = [(row["severity"], row["text"], row["station"]) for row in events[:told]]
+    assert said == [
+        (b"warning", b"IMU_GYRO does not come: switch it on", True),
+        (b"warning", b"short: frames have a wrong length, or make no sample", False),
+    ]
+    report = monitor.report(0)
+    assert report["lacking"] == {"sbg": "IMU_GYRO does not come: switch it on"}
+    assert "IMU_GYRO does not come" in headline(report)
 
 
 def run(chosen, batch, cuts=()):

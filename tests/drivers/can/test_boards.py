@@ -456,6 +456,66 @@ def test_rotation_vectors_are_those_of_scipy(vector, scale):
     np.testing.assert_allclose(rotation_vector(scale * q[None])[0], vector, atol=1e-12)
 
 
+MESSAGES = [
+    ("sbg", 0, "IMU_INFO"),
+    ("sbg", 1, "IMU_ACCEL"),
+    ("sbg", 2, "IMU_GYRO"),
+    ("xsens-can", 0, "SampleTime"),
+    ("xsens-can", 3, "DeltaV"),
+    ("xsens-can", 4, "RateOfTurn"),
+    ("j1939-imu", 0, "PGN 61482 (rates)"),
+    ("j1939-imu", 1, "PGN 61485 (accelerations)"),
+]
+
+
+@pytest.mark.parametrize("begins", [0, 50])
+@pytest.mark.parametrize(("name", "column", "message"), MESSAGES)
+def test_a_message_that_does_not_come_is_named(name, column, message, begins):
+    """Switched off from the start or from the sample `begins` on: told after 3 s, each frame counted, however they are cut."""
+    n = round(4.0 / BOARDS[name].period)
+    batch = sent(name, begins + n)
+    keep = np.ones(batch.shape, bool)
+    keep[begins:, column] = False
+    batch, status = batch[keep], xsens_status(batch[keep])
+    start, soon = begins * keep.shape[1], begins * keep.shape[1] + 2 * (n // 3)
+    driver, other = driver_of(name), driver_of(name)
+    driver.decode(batch[:soon])
+    assert driver.lacking() == ""
+    driver.decode(batch[soon:])
+    assert driver.lacking() == f"{message} does not come: switch it on"
+    assert abs(driver.counters.short - np.count_nonzero(~status[start:])) <= keep.shape[1]
+    fed(other, batch, range(0, len(batch), 3))
+    assert (driver.counters, driver.lacking()) == (other.counters, other.lacking())
+    driver.decode(sent(name, begins + n + 4, first=0)[-4:].reshape(-1))
+    assert driver.lacking() == ""
+
+
+def xsens_status(batch):
+    """Which frames are of no sample alone."""
+    return batch["can_id"] == 0x011
+
+
+def test_a_message_without_values_is_named():
+    batch = sent("j1939-imu", 400)
+    batch["data"][:, 0, :2] = 0xFF
+    driver = driver_of("j1939-imu")
+    assert len(fed(driver, batch)["time"]) == 0
+    assert driver.lacking().startswith("PGN 61482 (rates): every frame says that its values are not available")
+    assert faults(driver) == {"short": batch.size}
+
+
+@pytest.mark.parametrize("apart_us", [0, 70, 5000])
+def test_two_boards_of_the_same_identifiers_are_told(apart_us):
+    """Whether their frames come mixed or in turn."""
+    one, other = sent("sbg", 500), sent("sbg", 500, first=70_037)
+    other["time_ns"] = one["time_ns"] + 1000 * apart_us
+    both = np.concatenate([one.reshape(-1), other.reshape(-1)])
+    driver = driver_of("sbg")
+    fed(driver, both[np.argsort(both["time_ns"], kind="stable")])
+    assert "do two" in driver.lacking()
+    assert driver.counters.short + driver.counters.restarts > 100
+
+
 def test_a_damaged_exponent_is_dropped():
     batch = sent("xsens-can", 30)
     batch["data"][20, 3, 6] = 200
