@@ -10,7 +10,8 @@ sends one, else by its time in whole periods:
 - one of the last 63 that was not seen yet comes late, one that was seen is a duplicate; both are dropped;
 - by a counter, one that stands still while time goes on is dropped; where it goes on by one and time jumps, the clock was set,
   and time goes on by a period;
-- anything else is a board that started anew, and the period is learnt again.
+- anything else is a board that started anew, and the period is learnt again; so is one of which `SLOWER` distances in a row are
+  alike and longer than a period, if its counter does not say that samples are missing.
 
 A rate is that at the sample's time: the increment is the mean of both ends times the step; after a gap, the rate times one
 period.
@@ -32,6 +33,8 @@ MEASURE, WRONG = 256, 0.005
 """Samples over which the period of a board without a clock is measured, and the part by which it is wrong then."""
 WINDOW = 64
 """How far back a sample counts as late or duplicate rather than as a restart."""
+SLOWER = 16
+"""Distances in a row that tell another rate from lost samples."""
 LONGEST_S = 60.0
 """After a longer gap the board counts as started anew."""
 FOLLOW = 8
@@ -44,20 +47,8 @@ FLIP = np.array([1.0, -1.0, -1.0])
 TICKS, NUMBER, BAD, TURN, PUSH, TURN_IS, PUSH_IS, RAW = 0, 1, 2, 3, 6, 9, 10, 11
 RATE, MEAN_RATE, INCREMENT = 0, 1, 2
 
-(
-    _LEARNT,
-    _LAST_TICKS,
-    _LAST_NUMBER,
-    _TIME,
-    _SEQUENCE,
-    _SEEN,
-    _PERIOD,
-    _UNIT,
-    _TURN_HELD,
-    _PUSH_HELD,
-    _FROM_TICKS,
-    _FROM,
-) = range(12)
+_LEARNT, _LAST_TICKS, _LAST_NUMBER, _TIME, _SEQUENCE, _SEEN, _PERIOD, _UNIT, _TURN_HELD, _PUSH_HELD = range(10)
+_FROM_TICKS, _FROM, _LATEST, _ALIKE, _STATE = range(10, 15)
 _SAMPLES, _LOST, _DUPLICATED, _LATE, _RESTARTS, _FROZEN, _CLOCK_STEPS, _OUTCOMES = range(8)
 
 
@@ -141,6 +132,16 @@ def _measure(state: IntArray) -> None:
     state[_FROM_TICKS], state[_FROM] = state[_LAST_TICKS], state[_SEQUENCE]
 
 
+@inline_kernel
+def _is_slower(elapsed: int, expected: int, period: int, state: IntArray) -> bool:
+    """Whether the board sends at a lower rate than it did."""
+    is_long = 4 * (elapsed - expected) > period
+    is_alike = is_long and 8 * abs(elapsed - state[_LATEST]) <= period
+    state[_LATEST] = elapsed
+    state[_ALIKE] = state[_ALIKE] + 1 if is_alike else int(is_long)
+    return bool(state[_ALIKE] == SLOWER)
+
+
 @kernel
 def _take(
     raw: FloatArray,
@@ -176,10 +177,11 @@ def _take(
         if state[_UNIT] > 0 and number >= 0:
             delta = int(np.rint(signed(number - state[_LAST_NUMBER], 16) / state[_UNIT]))
             fits = abs(elapsed - delta * period) <= 0.5 * period * max(abs(delta), 1)
+            slower = _is_slower(elapsed, max(delta, 1) * period, period, state)
             if delta == 0 and not fits and abs(elapsed) * tick_s <= LONGEST_S:
                 outcome[_FROZEN] += 1
                 continue
-            if delta == 1 and not fits:
+            if delta == 1 and not (fits or slower):
                 outcome[_CLOCK_STEPS] += 1
                 elapsed, fits = period, True
         else:
@@ -187,7 +189,8 @@ def _take(
                 state[_FROM_TICKS] += elapsed - period
                 elapsed = period
             delta = int(np.rint(elapsed / period))
-        fits = fits and elapsed * tick_s <= LONGEST_S
+            slower = _is_slower(elapsed, period, period, state)
+        fits = fits and not slower and elapsed * tick_s <= LONGEST_S
         if grid > 0 and fits:
             if delta < 1:  # too early: after a gap, what was counted as lost had only been held up
                 delta = -1
@@ -255,7 +258,7 @@ class Samples:
         self._counters, self._tick_s = counters, tick_s
         self._grid, self._usual = round(grid_s / tick_s), round(usual_s / tick_s)
         self._learnt, self._before = np.zeros((2, LEARN_LONG), np.int64), np.zeros(6)
-        self._state, self._outcome = np.zeros(12, np.int64), np.zeros(_OUTCOMES, np.int64)
+        self._state, self._outcome = np.zeros(_STATE, np.int64), np.zeros(_OUTCOMES, np.int64)
         self._state[_LEARNT] = -1
         self._room(256)
 

@@ -22,7 +22,7 @@ from drivers.can.emulation import EndRates
 from drivers.can.frames import EFF, ERR, FDF, RTR, frames
 from drivers.can.j1939 import J1939Imu
 from drivers.can.j1939_emulator import J1939Emulator
-from drivers.can.samples import LEARN, LEARN_LONG
+from drivers.can.samples import LEARN, LEARN_LONG, SLOWER
 from drivers.can.sbg_emulator import SbgEmulator
 from drivers.can.xsens import Xsens, rotation_vector
 from drivers.can.xsens_emulator import XsensEmulator
@@ -339,6 +339,28 @@ def test_a_long_silence_is_a_restart():
     driver = driver_of("sbg")
     fed(driver, np.concatenate([sent("sbg", 30), sent("sbg", 30, first=30 + 5990)]))
     assert faults(driver) == {"lost": 5990}
+
+
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("name", ["sbg", "xsens-can", "xsens-can without its counter", "j1939-imu"])
+def test_another_rate_is_learnt(name, times):
+    """A board that is set to a half or a third of its rate loses nothing from then on; a counter tells it from lost samples."""
+    name, *without = name.split(" without ")
+    fast, slow = sent(name, 60), sent(name, 60 + 60 * times)[60 + times - 1 :: times]
+    batch = np.concatenate([fast, slow])
+    counted = name == "xsens-can" and not without
+    if name == "xsens-can":
+        lossy = driver_of(name)
+        fed(lossy, batch)
+        assert faults(lossy) == {"lost": 60 * (times - 1)}
+        batch["data"][60:, 1, 0], batch["data"][60:, 1, 1] = 0, np.arange(60, 120)
+        batch = batch if counted else np.delete(batch, 1, axis=1)
+    driver = driver_of(name)
+    out = fed(driver, batch)
+    at_first = {"clock_steps": SLOWER - 1} if counted else {"lost": (SLOWER - 1) * (times - 1)}
+    assert faults(driver) == {"restarts": 1} | at_first
+    assert len(out["time"]) == 120 - 2 * SET_CLOCK
+    np.testing.assert_allclose(out["step"][-20:], times * BOARDS[name].period, rtol=1e-9)
 
 
 @pytest.mark.parametrize(("one", "other"), [*permutations(BOARDS, 2)])
