@@ -66,7 +66,7 @@ def test_a_message_that_is_switched_off_is_told():
     said = [(row["severity"], row["text"], row["station"]) for row in events[:told]]
     assert said == [
         (b"warning", b"IMU_GYRO does not come: switch it on", True),
-        (b"warning", b"short: frames have a wrong length, or make no sample", False),
+        (b"warning", b"short: frames have a wrong length, lack a value or make no sample", False),
     ]
     report = monitor.report(0)
     assert report["lacking"] == {"sbg": "IMU_GYRO does not come: switch it on"}
