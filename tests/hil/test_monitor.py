@@ -297,7 +297,7 @@ def test_what_is_compiled_at_the_first_frames_is_not_listened(tmp_path: Path) ->
     fresh = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     with sending(url, sent_by("sbg", 60_000)):
         found = subprocess.run([*command, "--duration", "1"], capture_output=True, env=fresh, timeout=300, check=True)
-    assert any(tmp_path.rglob("*.nbi"))
+    assert any(tmp_path.rglob("*.nbk"))
     assert json.loads(found.stdout)["driver"] == "sbg"
 
 
