@@ -16,7 +16,7 @@ from drivers import Counters
 from drivers.can.aiding import is_aiding
 from drivers.can.codec import MessageCodec
 from drivers.can.frames import FDF, FrameArray
-from drivers.can.lacking import LACK, made, told, wait
+from drivers.can.lacking import LACK, again, made, told, wait
 from drivers.can.samples import (
     BAD,
     NUMBER,
@@ -100,6 +100,7 @@ def _join(
                 elapsed = signed(ticks - state[_TICKS], 32)
                 if elapsed == 0:
                     duplicated += 1
+                    useless -= again(lack)
                     continue
                 if state[_DUE] == 0 and state[_SENT] == 0 and _is_whole(state[_HAVE]):
                     _put(state, held, turn_delta, delta_is, raw[n])
@@ -123,6 +124,7 @@ def _join(
                 same = same and held[what, i] == value[k, i]
             if same:
                 duplicated += 1
+                useless -= again(lack)
             else:
                 state[_SENT] = 1  # of another sample: what is open can no longer be trusted
             continue

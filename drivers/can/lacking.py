@@ -31,6 +31,15 @@ def wait(what: int, arrival_ns: int, lack: IntArray) -> int:
 
 
 @inline_kernel
+def again(lack: IntArray) -> int:
+    """The frame that was taken last is one that came twice, and counted as that; how many it was counted as useless."""
+    if lack[WAITING] == 0:
+        return 1
+    lack[WAITING] -= 1
+    return 0
+
+
+@inline_kernel
 def made(lack: IntArray) -> None:
     """A sample was made."""
     lack[:] = 0

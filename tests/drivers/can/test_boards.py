@@ -512,6 +512,17 @@ def test_a_message_that_does_not_come_is_named(name, column, message, begins):
     assert driver.lacking() == ""
 
 
+@pytest.mark.parametrize("name", ["sbg", "xsens-can"])
+def test_a_frame_that_comes_twice_is_counted_once(name):
+    """The opening message and its repetition, nothing else: one is of no use, the other a duplicate."""
+    batch = np.repeat(sent(name, round(4.0 / BOARDS[name].period))[:, :1], 2, axis=1)
+    driver = driver_of(name)
+    for row in batch:
+        driver.decode(row)
+    assert driver.lacking() != ""
+    assert faults(driver) == {"duplicated": len(batch), "short": len(batch)}
+
+
 def xsens_status(batch):
     """Which frames are of no sample alone."""
     return batch["can_id"] == 0x011
