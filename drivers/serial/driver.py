@@ -4,6 +4,7 @@ What differs is a `Board`: how its packets are found and what one says.
 """
 
 import math
+from collections.abc import Set
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -21,6 +22,21 @@ from nav.increments import ImuIncrements, IntArray, Validity
 Three = tuple[float, float, float]
 _LARGEST = 1e4
 """A rotation vector (rad) or velocity change (m/s) of a step beyond this is damage."""
+
+
+class Pairing:
+    """Tells whether the increments of angle and velocity in a packet, by their names, are of the same time."""
+
+    def __init__(self, angle: int, velocity: int) -> None:
+        self._names, self._uneven = {angle, velocity}, False
+
+    def fits(self, names: Set[int]) -> bool:
+        """Whether both are among `names`, and the last that came did not come alone: one of them covers more time then."""
+        came = self._names & names
+        fit = came == self._names and not self._uneven
+        if came:
+            self._uneven = came != self._names
+        return fit
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ import struct
 from itertools import accumulate
 
 from drivers.serial.dialog import Dialog, check_line
-from drivers.serial.driver import Reading, SerialDriver, Three
+from drivers.serial.driver import Pairing, Reading, SerialDriver, Three
 from drivers.serial.stream import MORE, NONE
 from nav.earth import STANDARD_GRAVITY
 from nav.errors import HilError
@@ -27,8 +27,7 @@ WRITE, READ = 0x01, 0x02
 """Function selectors."""
 _WEEK_NS = 604_800 * 10**9
 _LONGEST_STEP_NS = 100 * 10**9
-_INCREMENTS = {DELTA_THETA, DELTA_VELOCITY}
-_VECTORS = {ACCELERATION, RATE, *_INCREMENTS}
+_VECTORS = {ACCELERATION, RATE, DELTA_THETA, DELTA_VELOCITY}
 _OVERRANGED = 0x0077
 """Bits of the overrange status: axes of the accelerometer and of the gyro."""
 OUTPUTS = (REFERENCE_TIME, DELTA_THETA, DELTA_VELOCITY)
@@ -69,8 +68,7 @@ class Mip:
     turn = 0
 
     def __init__(self) -> None:
-        self._uneven = False
-        """The last increment came alone, so the next two together are not of the same time."""
+        self._pairing = Pairing(DELTA_THETA, DELTA_VELOCITY)
 
     def size(self, data: bytes, at: int) -> int:
         """See `Framing.size`."""
@@ -92,10 +90,7 @@ class Mip:
         fields = dict(listed)
         if fields.keys().isdisjoint(_VECTORS):
             return "foreign"
-        both = fields.keys() >= _INCREMENTS
-        coned = both and not self._uneven
-        if not fields.keys().isdisjoint(_INCREMENTS):
-            self._uneven = not both
+        coned = self._pairing.fits(fields.keys())
         turn, push = (DELTA_THETA, DELTA_VELOCITY) if coned else (RATE, ACCELERATION)
         time_ns = _time_ns(fields)
         if time_ns is None or not {turn, push} <= fields.keys():

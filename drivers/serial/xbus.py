@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from drivers.serial.dialog import Dialog, check_line
-from drivers.serial.driver import Reading, SerialDriver, Three, rotation_vector
+from drivers.serial.driver import Pairing, Reading, SerialDriver, Three, rotation_vector
 from drivers.serial.stream import MORE, NONE
 from nav.errors import HilError
 
@@ -31,8 +31,7 @@ TICK_NS = 100_000
 """Of SampleTimeFine."""
 TEMPERATURE, COUNTER, TIME_FINE, STATUS = 0x0810, 0x1020, 0x1060, 0xE020
 DELTA_Q, DELTA_V, RATE, ACCELERATION = 0x8030, 0x4010, 0x8020, 0x4020
-_INCREMENTS = {DELTA_Q, DELTA_V}
-_VECTORS = {ACCELERATION, RATE, *_INCREMENTS}
+_VECTORS = {ACCELERATION, RATE, DELTA_Q, DELTA_V}
 NO_RATE = 0xFFFF
 """In the place of a rate: with each message, for counter, time and status; that it grants none, for increments."""
 SIZE = 65
@@ -130,8 +129,7 @@ class Xbus:
 
     def __init__(self) -> None:
         self._said: dict[str, object] = {}
-        self._uneven = False
-        """The last increment came alone, so the next two together are not of the same time."""
+        self._pairing = Pairing(DELTA_Q, DELTA_V)
 
     def size(self, data: bytes, at: int) -> int:
         """See `Framing.size`."""
@@ -162,10 +160,7 @@ class Xbus:
         self._said["status"] = status
         if fields.keys().isdisjoint(_VECTORS):
             return "foreign"  # a packet of slower outputs
-        both = fields.keys() >= _INCREMENTS
-        coned = both and not self._uneven
-        if not fields.keys().isdisjoint(_INCREMENTS):
-            self._uneven = not both
+        coned = self._pairing.fits(fields.keys())
         turn, push = (DELTA_Q, DELTA_V) if coned else (RATE, ACCELERATION)
         if not {turn, push, COUNTER, TIME_FINE} <= fields.keys():
             return "short"
