@@ -19,6 +19,7 @@ from typing import Any
 
 from hil.bench.timing import Row, row
 from hil.bridge import LoopOrder
+from hil.dashboard import open_window
 from hil.scenario import Scenario, load
 from hil.session import Session, simulated_head
 
@@ -43,7 +44,7 @@ class Condition:
     realtime, busy : bool
         Claim real-time priority; a process that never rests beside it on every processor.
     readers : bool
-        A recorder, and three links (UDP, and two clients over TCP) instead of one.
+        A dashboard, a recorder, and three links (UDP, and two clients over TCP) instead of one.
     stopped : bool
         One of the TCP clients is stopped (SIGSTOP) while it runs.
     """
@@ -61,7 +62,7 @@ CONDITIONS = (
     Condition("busy", "the same beside a busy process on every processor", busy=True),
     Condition("realtime", "1 kHz, --realtime", realtime=True),
     Condition("realtime-busy", "the same beside a busy process on every processor", realtime=True, busy=True),
-    Condition("readers", "1 kHz, recorder and three links", readers=True),
+    Condition("readers", "1 kHz, dashboard, recorder and three links", readers=True),
     Condition("stopped", "the same, a client stopped", readers=True, stopped=True),
 )
 
@@ -84,16 +85,17 @@ def rows(say: Callable[[str], None], seconds: float) -> list[Row]:
 def run(scenario: Scenario, condition: Condition) -> dict[str, Any]:
     """The summary of a run of `scenario`."""
     with ExitStack() as stack:
-        record = None
+        record, window = None, None
         links = [f"udpout:127.0.0.1:{stack.enter_context(_sink())}"]
         ports = [_free_port(), _free_port()] if condition.readers else []
         if condition.readers:
             record = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run.dhil"
+            window = open_window(None, lambda _: None)
             links += [f"tcpin:127.0.0.1:{port}" for port in ports]
         for _ in range(os.cpu_count() or 1 if condition.busy else 0):
             stack.enter_context(_process(_SPIN))
         order = LoopOrder(scenario.with_changes(mavlink={"links": links}), own_world=True, realtime=condition.realtime)
-        session = stack.enter_context(Session(order, feeder=simulated_head(order), record=record))
+        session = stack.enter_context(Session(order, feeder=simulated_head(order), record=record, window=window))
         session.wait_ready()
         clients = [stack.enter_context(_process(_CLIENT, "127.0.0.1", str(port))) for port in ports]
         while session.running and session.outlets.stats["covered_us"] < 1e6 * WARM_S:
